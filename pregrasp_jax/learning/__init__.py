@@ -1,0 +1,1 @@
+"""Networks, replay and the learner."""

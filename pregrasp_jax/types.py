@@ -1,0 +1,206 @@
+"""The contract that every stage shares: hulls, scenes, observations and what a push did.
+
+Everything is a frozen pytree and, unless a docstring says otherwise, describes ONE scene (unbatched);
+batches come from `jax.vmap` at the edge. Poses are ``[x, y, z, qw, qx, qy, qz]`` in metres.
+"""
+
+from typing import Any
+
+import flax.struct as struct
+import jax
+
+MAX_OBJECTS = 8
+"""Object slots in a compiled scene; the paper packs 5 to 8 objects."""
+
+MAX_HULLS = 6
+"""Convex hulls per object."""
+
+FULL_TOPOLOGY = (32, 60, 90)
+"""Vertices V, faces F = 2V - 4, edges E = 3V - 6 of a hull at the `full` level (native physics, drawing)."""
+
+COARSE_TOPOLOGY = (16, 28, 42)
+"""V, F, E at the `coarse` level (MJX)."""
+
+TABLE_ID = 0
+"""Instance id of the table; slot i has id i + 1."""
+
+ROBOT_ID = MAX_OBJECTS + 1
+"""Instance id of every robot link."""
+
+CLOSED, OPEN = 0, 1
+"""Aperture of the hand, and the last axis of the Q map."""
+
+REASONS = (
+    "running",
+    "nan",
+    "unreachable",
+    "off_table",
+    "target_toppled",
+    "target_in_region",
+    "obstacle_in_region",
+    "no_action",
+    "truncated",
+)
+"""Why an episode ended; an integer reason indexes this tuple, earlier entries win."""
+
+
+class Hulls(struct.PyTreeNode):
+    """M convex hulls padded to one topology by repeating their last vertex, face and edge.
+
+    Attributes:
+        vertices: [M, V, 3] float32, m.
+        planes: [M, F, 4] float32 rows (n, d) with unit outward n: a point x is inside iff n . x <= d for all.
+        edges: [M, E, 2] int32 vertex indices.
+    """
+
+    vertices: jax.Array
+    planes: jax.Array
+    edges: jax.Array
+
+
+class HullBank(struct.PyTreeNode):
+    """A catalogue of N objects, each a set of at most `MAX_HULLS` convex hulls.
+
+    The object frame has its origin on the base plane below the centre of mass of the standing object, z up.
+
+    Attributes:
+        full: the M hulls at `FULL_TOPOLOGY`.
+        coarse: the same M hulls at `COARSE_TOPOLOGY`.
+        object_hulls: [N, MAX_HULLS] int32 index into the hulls, -1 where absent.
+        mass: [N] kg.
+        com: [N, 3] m, centre of mass (x = y = 0 by construction of the frame).
+        inertia: [N, 3] kg m^2, principal moments about the centre of mass.
+        inertia_quat: [N, 4] wxyz, principal axes in the object frame.
+        friction: [N] sliding friction of the surface against other objects.
+        height: [N] m.
+        min_width: [N] m, smallest caliper width of the vertical projection.
+        best_coverage: [N] coverage by the closing region at the best yaw.
+        eligible: [N] bool, whether the object may be a target.
+        names: N object names.
+        content_hash: hash of everything that shaped the bank.
+    """
+
+    full: Hulls
+    coarse: Hulls
+    object_hulls: jax.Array
+    mass: jax.Array
+    com: jax.Array
+    inertia: jax.Array
+    inertia_quat: jax.Array
+    friction: jax.Array
+    height: jax.Array
+    min_width: jax.Array
+    best_coverage: jax.Array
+    eligible: jax.Array
+    names: tuple[str, ...] = struct.field(pytree_node=False)
+    content_hash: str = struct.field(pytree_node=False)
+
+
+class SceneParams(struct.PyTreeNode):
+    """What goes into an engine: which object stands where, and which one is wanted.
+
+    Attributes:
+        object_ids: [MAX_OBJECTS] int32 index into the hull bank, -1 for an empty slot.
+        poses: [MAX_OBJECTS, 7] float32 pose of each object frame in the world.
+        target: () int32 slot of the target.
+    """
+
+    object_ids: jax.Array
+    poses: jax.Array
+    target: jax.Array
+
+
+class PhysicsObservation(struct.PyTreeNode):
+    """What comes out of an engine.
+
+    Attributes:
+        object_poses: [MAX_OBJECTS, 7] float32.
+        joint_pos: [8] float32 rad: six arm joints, left and right finger drive.
+        hand_pose: [7] float32 pose of the grasp point frame (x forward, z up) in the world.
+        diverged: () bool, NaN or an engine warning.
+    """
+
+    object_poses: jax.Array
+    joint_pos: jax.Array
+    hand_pose: jax.Array
+    diverged: jax.Array
+
+
+class Observation(struct.PyTreeNode):
+    """What a camera above the table sees, on the grid; row = y, col = x.
+
+    Attributes:
+        height: [H, W] uint8, 0 to 255 for 0 to 0.30 m above the table (see `grid.quantize_height`).
+        instance_ids: [H, W] uint8, `TABLE_ID`, slot + 1, or `ROBOT_ID`.
+    """
+
+    height: jax.Array
+    instance_ids: jax.Array
+
+
+class Outcome(struct.PyTreeNode):
+    """What a push did, for every object, so that any of them can be judged as the target (hindsight).
+
+    Attributes:
+        coverage: [MAX_OBJECTS] float32 share of each object inside the closing region after the push.
+        distance_before: [MAX_OBJECTS] float32 m, planar distance centroid to grasp point before the push.
+        distance_after: [MAX_OBJECTS] float32 m, the same after it.
+        toppled: [MAX_OBJECTS] bool, tilted more than 0.7 rad after the push.
+        off_table: () bool, some object left the workspace.
+        unreachable: () bool, the push could not be executed, or ended more than 10 mm away.
+        no_action: () bool, the half ring after the push holds no cell.
+        diverged: () bool, the physics returned NaN.
+    """
+
+    coverage: jax.Array
+    distance_before: jax.Array
+    distance_after: jax.Array
+    toppled: jax.Array
+    off_table: jax.Array
+    unreachable: jax.Array
+    no_action: jax.Array
+    diverged: jax.Array
+
+
+class EnvState(struct.PyTreeNode):
+    """State of one scene between pushes.
+
+    Attributes:
+        physics: the engine's own pytree.
+        scene: what the episode started from.
+        scene_index: () int32 row of the scene bank.
+        physics_obs: what the engine reports now.
+        obs: what the camera sees now.
+        centroids: [MAX_OBJECTS, 2] float32 m, planar centre of mass of each object.
+        p1: [2] float32 m, commanded end of the last push, centre of the half ring.
+        aperture: () int32, `CLOSED` or `OPEN`.
+        num_pushes: () int32 pushes so far in this episode.
+    """
+
+    physics: Any
+    scene: SceneParams
+    scene_index: jax.Array
+    physics_obs: PhysicsObservation
+    obs: Observation
+    centroids: jax.Array
+    p1: jax.Array
+    aperture: jax.Array
+    num_pushes: jax.Array
+
+
+class StepResult(struct.PyTreeNode):
+    """What `env.step` returns beside the next state.
+
+    Attributes:
+        outcome: what the push did, per object.
+        reward: () float32 for the scene's own target.
+        terminated: () bool, the episode ended by itself.
+        truncated: () bool, it ran out of pushes.
+        reason: () int32 index into `REASONS`.
+    """
+
+    outcome: Outcome
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    reason: jax.Array
