@@ -1,0 +1,306 @@
+"""Every setting of a run: one frozen dataclass per stage, and the presets.
+
+The docstring under a field is its command-line help. `Config.validate` is called wherever a config enters
+the program, so that a value out of range is one line before anything compiles.
+"""
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Engine = Literal["native", "mjx", "warp"]
+Camera = Literal["orthographic", "pinhole"]
+ObjectSet = Literal["seen", "unseen"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssetsConfig:
+    """Which objects."""
+
+    object_dir: str | None = None
+    """Folder of .obj/.stl/.ply/.glb meshes (DIR/seen and DIR/unseen if present); None is the built-in catalogue."""
+    object_set: ObjectSet = "seen"
+    """Training uses `seen`; `unseen` holds objects kept for evaluation (Sec. IV-A)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneConfig:
+    """Packed scenes: how many, and how crowded."""
+
+    min_objects: int = 5
+    """Fewest objects in a scene (Sec. IV-A)."""
+    max_objects: int = 8
+    """Most objects in a scene (Sec. IV-A); at most the 8 slots of the compiled model."""
+    train_scenes: int = 512
+    """Scenes in the training bank; every reset also draws a yaw and a target."""
+    validation_scenes: int = 50
+    """Scenes on which checkpoints are compared during training."""
+    test_scenes: int = 200
+    """Scenes of `evaluate.py`, with fixed yaw and target."""
+    bank_seed: int = 0
+    """Seed of the banks; training, validation and test draw from disjoint streams of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig:
+    """The task of the paper: pushes in a half ring, ten per episode."""
+
+    r_in: float = 0.04
+    """m, inner radius of the half ring (Eq. 1)."""
+    r_out: float = 0.15
+    """m, outer radius of the half ring (Eq. 1)."""
+    full_ring: bool = False
+    """Allow backward pushes too: the paper's Full-Ring ablation."""
+    max_pushes: int = 10
+    """Pushes before an episode is truncated (Sec. IV-A)."""
+    push_speed: float = 0.1
+    """m/s, mean speed of the minimum-jerk push."""
+    camera: Camera = "orthographic"
+    """`orthographic` draws exact heightmaps; `pinhole` sees what a 640 x 480 overhead RGB-D camera sees."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhysicsConfig:
+    """Which engine steps the scenes."""
+
+    engine: Engine = "native"
+    """`native`: MuJoCo's C engine on CPU threads; `mjx`: one XLA program; `warp`: MJX-Warp on NVIDIA GPUs."""
+    threads: int = 0
+    """Threads of the native engine; 0 takes every core. Results do not depend on it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig:
+    """The Q-network of Fig. 3."""
+
+    width: float = 1.0
+    """Factor on all channel counts; 1.0 is the paper's 7.4 M parameters, 0.25 has 0.46 M."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayConfig:
+    """Prioritized replay with hindsight rows."""
+
+    capacity: int = 50_000
+    """Observations kept, 20 kB each."""
+    priority_exponent: float = 0.6
+    """Alpha of prioritized replay; 0 samples uniformly."""
+    importance_exponent: float = 0.4
+    """Beta at the start; it rises linearly to 1 over the run."""
+    hindsight: bool = True
+    """Replay episodes that enclosed an obstacle with that obstacle as the target; False is the No-HER ablation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnerConfig:
+    """Q-learning (Sec. III-E)."""
+
+    learning_rate: float = 1e-4
+    """Adam step size."""
+    discount: float = 0.5
+    """Gamma."""
+    polyak: float = 0.999
+    """Share of the target network kept at each update."""
+    huber_delta: float = 0.1
+    """Where the Huber loss turns linear (Eq. 4)."""
+    batch_size: int = 16
+    """Transitions per update."""
+    updates_per_step: float = 0.125
+    """Updates per env step (a push of one scene); 16 scenes at 0.125 make 2 updates per parallel step."""
+    warmup: int = 500
+    """Env steps of pure exploration before the first update."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplorationConfig:
+    """Epsilon-greedy with guided random actions."""
+
+    epsilon_start: float = 1.0
+    """Share of random actions at the first env step."""
+    epsilon_end: float = 0.1
+    """Share of random actions after the decay."""
+    epsilon_decay: int = 20_000
+    """Env steps over which epsilon falls linearly."""
+    guided: bool = True
+    """Random actions aim at the target inside the half ring; False draws from all 20 000 (Random-Exp ablation)."""
+    angle_std: float = 0.5
+    """rad, spread of guided actions around the direction to the target."""
+    open_probability: float = 0.7
+    """Share of guided actions with an open hand."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """How long, how wide, how often."""
+
+    num_envs: int = 16
+    """Scenes stepped in parallel."""
+    episodes: int = 45_000
+    """Stop after this many episodes (the paper trains for 45 K) ..."""
+    minutes: float = 0.0
+    """... or after this many minutes of training time, resumed time included; 0 sets no limit."""
+    checkpoint_minutes: float = 5.0
+    """Time between checkpoints: the most that a crash can lose."""
+    evaluate_every: int = 5_000
+    """Env steps between evaluations on the validation scenes; 0 evaluates only at the end."""
+    log_every: int = 200
+    """Env steps between rows of metrics.jsonl."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """One run."""
+
+    seed: int = 0
+    """Seed of initial weights, exploration and resets."""
+    assets: AssetsConfig = field(default_factory=AssetsConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    task: TaskConfig = field(default_factory=TaskConfig)
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+    def validate(self) -> "Config":
+        """Return self.
+
+        Raises:
+            ValueError: a value is outside its range; one line names the key, the value and the range.
+        """
+        for key, (low, high) in _RANGES.items():
+            stage, name = key.split(".")
+            value = getattr(getattr(self, stage), name)
+            if not low <= value <= high:
+                raise ValueError(f"{key} = {value} is out of range; allowed is {low} to {high}")
+        if self.task.r_in >= self.task.r_out:
+            raise ValueError(f"task.r_in = {self.task.r_in} must be below task.r_out = {self.task.r_out}")
+        if self.scene.min_objects > self.scene.max_objects:
+            raise ValueError(
+                f"scene.min_objects = {self.scene.min_objects} must not exceed scene.max_objects = "
+                f"{self.scene.max_objects}"
+            )
+        return self
+
+
+_RANGES: dict[str, tuple[float, float]] = {
+    "scene.min_objects": (1, 8),
+    "scene.max_objects": (1, 8),
+    "scene.train_scenes": (1, 100_000),
+    "scene.validation_scenes": (1, 100_000),
+    "scene.test_scenes": (1, 100_000),
+    "scene.bank_seed": (0, 2**31 - 1),
+    "task.r_in": (0.005, 0.5),
+    "task.r_out": (0.01, 0.5),
+    "task.max_pushes": (1, 100),
+    "task.push_speed": (0.02, 1.0),
+    "physics.threads": (0, 1024),
+    "network.width": (1 / 32, 4.0),
+    "replay.capacity": (64, 10_000_000),
+    "replay.priority_exponent": (0.0, 1.0),
+    "replay.importance_exponent": (0.0, 1.0),
+    "learner.learning_rate": (1e-7, 1.0),
+    "learner.discount": (0.0, 0.999),
+    "learner.polyak": (0.0, 1.0),
+    "learner.huber_delta": (1e-4, 100.0),
+    "learner.batch_size": (1, 4096),
+    "learner.updates_per_step": (0.0, 100.0),
+    "learner.warmup": (0, 10_000_000),
+    "exploration.epsilon_start": (0.0, 1.0),
+    "exploration.epsilon_end": (0.0, 1.0),
+    "exploration.epsilon_decay": (1, 1_000_000_000),
+    "exploration.angle_std": (0.0, 10.0),
+    "exploration.open_probability": (0.0, 1.0),
+    "train.num_envs": (1, 65_536),
+    "train.episodes": (1, 1_000_000_000),
+    "train.minutes": (0.0, 1e6),
+    "train.checkpoint_minutes": (0.0, 1e6),
+    "train.evaluate_every": (0, 1_000_000_000),
+    "train.log_every": (1, 1_000_000_000),
+}
+
+_CPU = Config(
+    network=NetworkConfig(width=0.25),
+    train=TrainConfig(num_envs=16, episodes=25_000, minutes=150.0),
+)
+
+PRESETS: dict[str, Config] = {
+    "ci": Config(
+        scene=SceneConfig(train_scenes=4, validation_scenes=2, test_scenes=2),
+        network=NetworkConfig(width=0.0625),
+        replay=ReplayConfig(capacity=256),
+        learner=LearnerConfig(batch_size=4, warmup=8, updates_per_step=0.5),
+        exploration=ExplorationConfig(epsilon_decay=64),
+        train=TrainConfig(num_envs=2, episodes=1_000_000, minutes=1.0, evaluate_every=0, log_every=2),
+    ),
+    "demo": dataclasses.replace(
+        _CPU,
+        scene=SceneConfig(train_scenes=64, validation_scenes=10, test_scenes=50),
+        replay=ReplayConfig(capacity=5_000),
+        exploration=ExplorationConfig(epsilon_decay=3_000),
+        train=TrainConfig(num_envs=16, episodes=2_000, minutes=5.0, evaluate_every=0),
+    ),
+    "cpu": _CPU,
+    "paper": Config(),
+}
+"""`ci`: 2 scenes, a minute, for tests. `demo`: minutes, shows every part. `cpu`: two cores, 150 minutes.
+`paper`: width 1.0, 45 K episodes, as published."""
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Return a config as nested plain dicts, ready for YAML or JSON."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(values: Mapping[str, Any], cls: type = Config, prefix: str = "") -> Any:
+    """Build a config from nested dicts.
+
+    Raises:
+        ValueError: an unknown key or a value of the wrong type; one line names it and what is allowed.
+    """
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{prefix or 'config'} must be a mapping, got {type(values).__name__}")
+    hints = typing.get_type_hints(cls)
+    unknown = sorted(set(values) - set(hints), key=str)
+    if unknown:
+        raise ValueError(f"unknown config key {prefix}{unknown[0]}; allowed here: {', '.join(sorted(hints))}")
+    fields = {}
+    for name, value in values.items():
+        if dataclasses.is_dataclass(hints[name]):
+            fields[name] = from_dict(value, typing.cast(type, hints[name]), f"{prefix}{name}.")
+        else:
+            fields[name] = _checked(value, hints[name], f"{prefix}{name}")
+    return cls(**fields)
+
+
+def _checked(value: Any, hint: Any, key: str) -> Any:
+    """Return `value` if it is of type `hint` (an int passes for a float)."""
+    origin = typing.get_origin(hint)
+    if origin is Literal:
+        if value not in typing.get_args(hint):
+            raise ValueError(f"{key} = {value!r} is unknown; allowed: {', '.join(typing.get_args(hint))}")
+        return value
+    allowed = typing.get_args(hint) if origin in (typing.Union, types.UnionType) else (hint,)
+    if float in allowed and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(value) not in allowed:
+        names = " or ".join("null" if t is type(None) else t.__name__ for t in allowed)
+        raise ValueError(f"{key} = {value!r} has the wrong type; allowed: {names}")
+    return value
+
+
+def difference(old: Config, new: Config) -> list[str]:
+    """Return one line ``key: old -> new`` for every setting in which two configs differ."""
+    flat_old, flat_new = _flatten(to_dict(old)), _flatten(to_dict(new))
+    return [f"{key}: {flat_old[key]} -> {flat_new[key]}" for key in flat_old if flat_old[key] != flat_new[key]]
+
+
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat = {}
+    for key, value in values.items():
+        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
+    return flat
