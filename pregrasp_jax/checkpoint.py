@@ -1,0 +1,186 @@
+"""Checkpoints of the whole state.
+
+    checkpoints/
+        000012800/state.safetensors     every leaf of the training state but the observations
+                  manifest.json         written last: without it the checkpoint does not exist
+        replay/000000000000-....npz     observations, append-only (see `replay_chunks`)
+
+Every file carries a checksum. A damaged checkpoint is set aside and the one before it is used.
+"""
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pregrasp_jax import io, replay_chunks, tree_files
+from pregrasp_jax.replay_chunks import Chunk, Ring
+from pregrasp_jax.tree_files import DamagedFileError
+
+FORMAT = 1
+"""Version of the layout above."""
+
+KEEP = 3
+"""Checkpoints kept: two to fall back to."""
+
+_STATE, _MANIFEST, _REPLAY = "state.safetensors", "manifest.json", "replay"
+
+
+@dataclasses.dataclass(frozen=True)
+class Restored:
+    """A checkpoint that was read back.
+
+    Attributes:
+        step: env steps at which it was taken.
+        tree: the state.
+        ring: the observations.
+        extra: what `save` was given.
+        problems: one line for every newer checkpoint that was damaged and has been set aside.
+    """
+
+    step: int
+    tree: Any
+    ring: Any
+    extra: dict[str, Any]
+    problems: tuple[str, ...]
+
+
+def save(folder: Path, step: int, tree: Any, ring: Ring, extra: dict[str, Any]) -> Path:
+    """Write a checkpoint, then delete what is older than the last `KEEP`.
+
+    A crash at any instant leaves the previous checkpoints intact.
+
+    Args:
+        folder: the run's `checkpoints`.
+        step: env steps so far, the name of the checkpoint.
+        tree: pytree of arrays, without the contents of the ring.
+        ring: observations; only those since the last checkpoint are written.
+        extra: JSON-able, for what lives on the host.
+
+    Returns:
+        The folder of the checkpoint.
+    """
+    target = folder / f"{step:09d}"
+    # An unfinished or outdated checkpoint of the same step must not gain a manifest that does not match it.
+    (target / _MANIFEST).unlink(missing_ok=True)
+    known = {chunk for path in _newest_first(folder) for chunk in _chunks(path)}
+    chunks = replay_chunks.append(folder / _REPLAY, ring, sorted(known))
+    state = tree_files.encode(tree_files.named_leaves(tree))
+    io.write_bytes(target / _STATE, state)
+    manifest = {
+        "format": FORMAT,
+        "step": step,
+        "state_sha256": hashlib.sha256(state).hexdigest(),
+        "state_checksum": tree_files.checksum(tree),
+        "observations": ring.written,
+        "chunks": [list(chunk) for chunk in chunks],
+        "extra": extra,
+    }
+    io.write_json(target / _MANIFEST, {"checksum": io.content_hash(manifest), **manifest})
+    _prune(folder)
+    return target
+
+
+def restore(folder: Path, template: Any, ring_template: Any) -> Restored:
+    """Read the newest intact checkpoint; damaged ones are renamed to ``*.damaged`` and reported.
+
+    Args:
+        folder: the run's `checkpoints`.
+        template: tree like the one given to `save`; arrays or `jax.ShapeDtypeStruct`.
+        ring_template: likewise for the contents of the ring.
+
+    Raises:
+        ValueError: there is no checkpoint, none is intact, or it belongs to another configuration.
+    """
+    damaged: dict[Path, str] = {}
+    for path in _newest_first(folder):
+        try:
+            manifest = _read_manifest(path)
+            tree = tree_files.rebuild(template, _read_state(path, manifest), origin=str(path / _STATE))
+            chunks = [Chunk(*row) for row in manifest["chunks"]]
+            ring = replay_chunks.restore(folder / _REPLAY, ring_template, manifest["observations"], chunks)
+        except DamagedFileError as error:
+            damaged[path] = str(error)
+            continue
+        for broken in damaged:
+            _set_aside(broken)
+        return Restored(manifest["step"], tree, ring, manifest["extra"], tuple(damaged.values()))
+    if damaged:
+        raise ValueError(
+            f"{folder}: none of {len(damaged)} checkpoints is intact; newest: {next(iter(damaged.values()))}; "
+            "--init-from starts a new run from its best policy"
+        )
+    raise ValueError(f"{folder} holds no checkpoint")
+
+
+def read_newest_arrays(folder: Path) -> tuple[dict[str, np.ndarray], Path]:
+    """Return the leaves of the newest intact checkpoint by path, and its file; changes nothing on disk.
+
+    Raises:
+        ValueError: there is none.
+    """
+    for path in _newest_first(folder):
+        try:
+            return _read_state(path, _read_manifest(path)), path / _STATE
+        except DamagedFileError:
+            continue
+    raise ValueError(f"{folder} holds no intact checkpoint")
+
+
+def _newest_first(folder: Path) -> Iterator[Path]:
+    """Yield the folders of committed checkpoints."""
+    named = [path for path in folder.glob("*") if path.name.isdigit() and (path / _MANIFEST).is_file()]
+    yield from sorted(named, key=lambda path: int(path.name), reverse=True)
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    origin = path / _MANIFEST
+    try:
+        manifest = json.loads(origin.read_bytes())
+        checksum, version = manifest.pop("checksum"), manifest["format"]
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError):
+        raise DamagedFileError(f"{origin} is damaged") from None
+    if io.content_hash(manifest) != checksum:
+        raise DamagedFileError(f"{origin} is altered (checksum differs)")
+    if version != FORMAT:
+        raise ValueError(f"{origin} has format {version}; this version reads {FORMAT}")
+    return manifest
+
+
+def _read_state(path: Path, manifest: dict[str, Any]) -> dict[str, np.ndarray]:
+    try:
+        data = (path / _STATE).read_bytes()
+    except OSError as error:
+        raise DamagedFileError(f"{path / _STATE} cannot be read ({error.strerror})") from None
+    if hashlib.sha256(data).hexdigest() != manifest["state_sha256"]:
+        raise DamagedFileError(f"{path / _STATE} is cut short or altered (checksum differs)")
+    return tree_files.decode(data, origin=str(path / _STATE))
+
+
+def _chunks(path: Path) -> list[Chunk]:
+    """Return the chunks that a checkpoint refers to; none if its manifest is damaged."""
+    try:
+        return [Chunk(*row) for row in _read_manifest(path)["chunks"]]
+    except DamagedFileError:
+        return []
+
+
+def _prune(folder: Path) -> None:
+    """Delete old and unfinished checkpoints, and the chunks that only they refer to."""
+    kept = list(_newest_first(folder))[:KEEP]
+    for path in folder.glob("*"):
+        if path.name.isdigit() and path not in kept:
+            shutil.rmtree(path, ignore_errors=True)
+    replay_chunks.collect_garbage(folder / _REPLAY, {chunk.name for path in kept for chunk in _chunks(path)})
+
+
+def _set_aside(path: Path) -> None:
+    aside = path.with_name(f"{path.name}.damaged")
+    shutil.rmtree(aside, ignore_errors=True)
+    os.replace(path, aside)

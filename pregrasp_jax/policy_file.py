@@ -1,0 +1,111 @@
+"""Policies on disk: network parameters that can be loaded without the run they come from.
+
+best/params.safetensors     complete by itself: parameters, and in its header config, evaluation, checksum
+config.yaml            the same for people
+evaluation.json
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pregrasp_jax import checkpoint, io, tree_files
+from pregrasp_jax.config import Config, from_dict, to_dict
+from pregrasp_jax.tree_files import DamagedFileError
+
+FORMAT = 1
+"""Version of the header of a policy."""
+
+PARAMS_PREFIX = "learner/params/"
+"""Where a training state keeps what a policy needs."""
+
+_PARAMS = "params.safetensors"
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A trained network.
+
+    Attributes:
+        params: parameters of the network, nested dicts of device arrays.
+        config: of the run that trained it.
+        evaluation: what was measured on the validation scenes when it was saved; may be empty.
+        origin: the file that it was read from.
+    """
+
+    params: Any
+    config: Config
+    evaluation: dict[str, Any]
+    origin: Path
+
+
+def save_policy(folder: Path, params: Any, config: Config, evaluation: dict[str, Any]) -> None:
+    """Write a policy. `params.safetensors` alone is complete; the two other files repeat its header for people."""
+    arrays = tree_files.named_leaves(params)
+    metadata = {
+        "format": f"pregrasp_jax policy {FORMAT}",
+        "config": json.dumps(to_dict(config)),
+        "evaluation": json.dumps(evaluation),
+        "checksum": tree_files.checksum(params),
+    }
+    io.write_bytes(folder / _PARAMS, tree_files.encode(arrays, metadata))
+    write_config(folder / "config.yaml", config)
+    io.write_json(folder / "evaluation.json", evaluation)
+
+
+def load_policy(path: Path | str) -> Policy:
+    """Read a policy from a run folder (its best policy, else its latest checkpoint), a policy folder, or a file.
+
+    Raises:
+        ValueError: nothing there, damaged, or not written by `save_policy`; one line says which.
+    """
+    path = Path(path)
+    for candidate in (path, path / _PARAMS, path / "best" / _PARAMS):
+        if candidate.is_file():
+            return _read_policy(candidate)
+    config_file = path / "config.yaml"
+    if config_file.is_file() and (path / "checkpoints").is_dir():
+        return _policy_of_checkpoint(path / "checkpoints", read_config(config_file))
+    problem = "is neither a run folder nor a policy folder" if path.is_dir() else "does not exist"
+    raise ValueError(f"policy {path} {problem}; allowed: a run folder of train.py, or a folder with {_PARAMS}")
+
+
+def write_config(path: Path, config: Config) -> None:
+    """Write a config.yaml."""
+    io.write_bytes(path, yaml.safe_dump(to_dict(config), sort_keys=False).encode())
+
+
+def read_config(path: Path) -> Config:
+    """Read a config.yaml.
+
+    Raises:
+        ValueError: not YAML, an unknown key, or a value of the wrong type or out of range.
+    """
+    try:
+        return from_dict(yaml.safe_load(path.read_text())).validate()
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError) as error:
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
+
+
+def _read_policy(path: Path) -> Policy:
+    data = path.read_bytes()
+    arrays = tree_files.decode(data, origin=str(path))
+    try:
+        metadata = tree_files.read_metadata(data)
+        config = from_dict(json.loads(metadata["config"]))
+        evaluation, expected = json.loads(metadata["evaluation"]), metadata["checksum"]
+    except (KeyError, json.JSONDecodeError):
+        raise ValueError(f"{path} was not written by this package: its header names no config") from None
+    params = tree_files.nest(arrays)
+    if tree_files.checksum(params) != expected:
+        raise DamagedFileError(f"{path} is altered (checksum differs)")
+    return Policy(params, config, evaluation, path)
+
+
+def _policy_of_checkpoint(folder: Path, config: Config) -> Policy:
+    arrays, origin = checkpoint.read_newest_arrays(folder)
+    params = {name.removeprefix(PARAMS_PREFIX): leaf for name, leaf in arrays.items() if name.startswith(PARAMS_PREFIX)}
+    return Policy(tree_files.nest(params), config, {}, origin)
