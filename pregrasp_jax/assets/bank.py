@@ -1,0 +1,215 @@
+"""The hull bank: build it from convex parts, join, select, save and load it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pregrasp_jax import io
+from pregrasp_jax.assets.hulls import make_hulls
+from pregrasp_jax.assets.measure import CLOSING_REGION_SIZE as CLOSING_REGION_SIZE
+from pregrasp_jax.assets.measure import measure
+from pregrasp_jax.types import COARSE_TOPOLOGY, FULL_TOPOLOGY, MAX_HULLS, HullBank, Hulls
+
+MAX_TARGET_WIDTH = 0.105
+"""m; an object whose narrowest width is not below this does not fit between the open fingers."""
+
+MIN_TARGET_COVERAGE = 0.97
+"""An eligible target's best coverage is above this, so that the 0.95 of the task can be reached."""
+
+DEFAULT_DENSITY = 300.0
+"""kg/m^3 of the hulls' union: mostly full packages, 0.08 to 0.53 kg over the paper's seen set."""
+
+DEFAULT_FRICTION = 0.25
+"""Sliding friction between objects."""
+
+_FORMAT = "pregrasp_jax hull bank 1"
+"""First entry of a bank file; the number changes with the meaning of the arrays."""
+
+_PER_OBJECT = ("mass", "com", "inertia", "inertia_quat", "friction", "height", "min_width", "best_coverage", "eligible")
+
+
+class ConvexObject(NamedTuple):
+    """What a bank is made of: one object as convex parts, standing upright.
+
+    Attributes:
+        name: unique within a bank.
+        parts: 1 to `MAX_HULLS` arrays [P, 3] m, z up; the lowest point is the base plane.
+        mass: kg, or None for `density` times the volume of the union of the parts.
+        density: kg/m^3, used where `mass` is None.
+        friction: sliding friction against other objects.
+    """
+
+    name: str
+    parts: Sequence[np.ndarray]
+    mass: float | None = None
+    density: float = DEFAULT_DENSITY
+    friction: float = DEFAULT_FRICTION
+
+
+def make_bank(objects: Sequence[ConvexObject]) -> HullBank:
+    """Return the bank of several objects, in order.
+
+    Raises:
+        ValueError: no object, a repeated name, or an object of more than `MAX_HULLS` parts or a flat part.
+    """
+    return concatenate([_make_single(item) for item in objects])
+
+
+def concatenate(banks: Sequence[HullBank]) -> HullBank:
+    """Join banks; hull indices are shifted, object order is kept.
+
+    Raises:
+        ValueError: no bank, or two objects of the same name.
+    """
+    if not banks:
+        raise ValueError("a hull bank needs at least 1 object, got 0")
+    shifts = np.cumsum([0] + [len(bank.full.vertices) for bank in banks[:-1]])
+    ids = [np.asarray(bank.object_hulls) for bank in banks]
+    return _finish(
+        full=_stack([bank.full for bank in banks]),
+        coarse=_stack([bank.coarse for bank in banks]),
+        object_hulls=np.concatenate([np.where(i >= 0, i + shift, -1) for i, shift in zip(ids, shifts, strict=True)]),
+        names=tuple(name for bank in banks for name in bank.names),
+        **{key: np.concatenate([getattr(bank, key) for bank in banks]) for key in _PER_OBJECT},
+    )
+
+
+def select(bank: HullBank, indices: Sequence[int] | np.ndarray) -> HullBank:
+    """Return the bank of the objects at `indices`, in that order, with only their hulls.
+
+    Raises:
+        ValueError: an index outside the bank.
+    """
+    indices = np.asarray(indices, dtype=int).reshape(-1)
+    bad = indices[(indices < 0) | (indices >= len(bank.names))]
+    if bad.size:
+        raise ValueError(f"object index {bad[0]} is outside the bank; allowed are 0 to {len(bank.names) - 1}")
+    old = np.asarray(bank.object_hulls)[indices]
+    object_hulls = np.where(old >= 0, np.cumsum(old.ravel() >= 0).reshape(old.shape) - 1, -1)
+    hulls = old[old >= 0]
+    return _finish(
+        full=jax.tree.map(lambda rows: np.asarray(rows)[hulls], bank.full),
+        coarse=jax.tree.map(lambda rows: np.asarray(rows)[hulls], bank.coarse),
+        object_hulls=object_hulls,
+        names=tuple(bank.names[i] for i in indices),
+        **{key: np.asarray(getattr(bank, key))[indices] for key in _PER_OBJECT},
+    )
+
+
+def ineligibility(bank: HullBank, index: int) -> str:
+    """Return why an object cannot be a target, one clause; empty if it can."""
+    width, coverage = float(bank.min_width[index]), float(bank.best_coverage[index])
+    reasons = []
+    if width >= MAX_TARGET_WIDTH:
+        reasons.append(f"narrowest width {width * 1e3:.0f} mm, must be < {MAX_TARGET_WIDTH * 1e3:.0f}")
+    if coverage <= MIN_TARGET_COVERAGE:
+        reasons.append(f"best coverage {coverage:.2f}, must be > {MIN_TARGET_COVERAGE}")
+    return "; ".join(reasons)
+
+
+def save_bank(path: Path, bank: HullBank) -> None:
+    """Write a bank as npz, whole or not at all."""
+    arrays = {
+        f"{level}_{key}": value for level in ("full", "coarse") for key, value in vars(getattr(bank, level)).items()
+    }
+    arrays |= {key: getattr(bank, key) for key in ("object_hulls", *_PER_OBJECT)}
+    io.write_npz(
+        path,
+        format=np.array(_FORMAT),
+        content_hash=np.array(bank.content_hash),
+        names=np.array(bank.names),
+        **{key: np.asarray(value) for key, value in arrays.items()},
+    )
+
+
+def load_bank(path: Path) -> HullBank:
+    """Read a bank written by `save_bank`.
+
+    Raises:
+        ValueError: the file is no hull bank, of another version, or its content does not match its hash.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        if str(arrays.pop("format")) != _FORMAT:
+            raise ValueError("format differs")
+        recorded = str(arrays.pop("content_hash"))
+        names = tuple(str(name) for name in arrays.pop("names"))
+        full, coarse = (
+            Hulls(**{key: arrays.pop(f"{level}_{key}") for key in ("vertices", "planes", "edges")})
+            for level in ("full", "coarse")
+        )
+        object_hulls = arrays.pop("object_hulls")
+        bank = _finish(full=full, coarse=coarse, object_hulls=object_hulls, names=names, **arrays)
+        if bank.content_hash != recorded:
+            raise ValueError("content hash differs")
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: not a readable '{_FORMAT}' file ({error}); delete it and build it again") from error
+    return bank
+
+
+def _make_single(item: ConvexObject) -> HullBank:
+    """Build the bank of one object in its own frame: base plane z = 0, centre of mass above the origin."""
+    if not 1 <= len(item.parts) <= MAX_HULLS:
+        raise ValueError(f"object '{item.name}' has {len(item.parts)} convex parts; allowed are 1 to {MAX_HULLS}")
+    parts = [np.asarray(part, np.float64) for part in item.parts]
+    lowest = min(part[:, 2].min() for part in parts)
+    parts = [part - [0.0, 0.0, lowest] for part in parts]
+    rough = make_hulls(parts, FULL_TOPOLOGY)
+    centre = measure(np.asarray(rough.vertices), np.asarray(rough.planes)).com * [1.0, 1.0, 0.0]
+    full = make_hulls([part - centre for part in parts], FULL_TOPOLOGY)
+    # The coarse hulls are subsets of the full ones, so that they lie inside them.
+    coarse = make_hulls(list(np.asarray(full.vertices, np.float64)), COARSE_TOPOLOGY)
+    found = measure(np.asarray(full.vertices), np.asarray(full.planes))
+    mass = found.volume * item.density if item.mass is None else item.mass
+    moments, axes = np.linalg.eigh(found.inertia * (mass / found.volume))
+    axes[:, 2] *= np.linalg.det(axes)  # a rotation, not a reflection
+    return _finish(
+        full=full,
+        coarse=coarse,
+        object_hulls=np.where(np.arange(MAX_HULLS) < len(parts), np.arange(MAX_HULLS), -1)[None],
+        names=(item.name,),
+        mass=np.array([mass]),
+        com=np.array([[0.0, 0.0, found.com[2]]]),
+        inertia=moments[None],
+        inertia_quat=Rotation.from_matrix(axes).as_quat(scalar_first=True)[None],
+        friction=np.array([item.friction]),
+        height=np.array([np.asarray(full.vertices)[..., 2].max()]),
+        min_width=np.array([found.min_width]),
+        best_coverage=np.array([found.best_coverage]),
+        eligible=np.array([found.min_width < MAX_TARGET_WIDTH and found.best_coverage > MIN_TARGET_COVERAGE]),
+    )
+
+
+def _finish(
+    *, full: Hulls, coarse: Hulls, object_hulls: np.ndarray, names: tuple[str, ...], **rows: np.ndarray
+) -> HullBank:
+    """Fix dtypes, check names and shapes, and hash the content."""
+    if len(set(names)) != len(names):
+        repeated = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"object name '{repeated}' is used twice; names must be unique")
+    if set(rows) != set(_PER_OBJECT) or object_hulls.shape != (len(names), MAX_HULLS):
+        raise ValueError(
+            f"a bank of {len(names)} objects needs {MAX_HULLS} hull slots each and {', '.join(_PER_OBJECT)}"
+        )
+    bank = HullBank(
+        full=jax.tree.map(jnp.asarray, full),
+        coarse=jax.tree.map(jnp.asarray, coarse),
+        object_hulls=jnp.asarray(object_hulls, jnp.int32),
+        names=names,
+        content_hash="",
+        **{key: jnp.asarray(value, bool if key == "eligible" else jnp.float32) for key, value in rows.items()},
+    )
+    digest = io.content_hash(_FORMAT, list(names), *[np.asarray(leaf) for leaf in jax.tree.leaves(bank)])
+    return bank.replace(content_hash=digest)
+
+
+def _stack(levels: Sequence[Hulls]) -> Hulls:
+    return jax.tree.map(lambda *rows: np.concatenate(rows), *levels)

@@ -1,0 +1,102 @@
+"""From one triangle mesh to at most six convex parts with a flat base.
+
+The mesh must be in metres, z up. Scans are repaired as far as that is safe, large ones decimated first, and
+the decomposition (CoACD) is deterministic: the same mesh gives the same parts.
+"""
+
+import coacd
+import numpy as np
+import trimesh
+
+from pregrasp_jax.assets.hulls import BASE_RING, simplify, volume
+from pregrasp_jax.types import FULL_TOPOLOGY, MAX_HULLS
+
+VERSION = 1
+"""Part of every cache key; to be raised whenever the same mesh would give other parts."""
+
+BASE_BAND = 0.004
+"""m; vertices lower than this are moved to z = 0: scanned bottoms are bumpy, and raw hulls rest tilted by 0.06
+to 0.13 rad, or fall by themselves."""
+
+MAX_FACES = 20_000
+"""Meshes with more faces are decimated to this many; a scan of a household object loses less than 0.1 mm."""
+
+_CONVEX_RATIO = 1.06
+"""A mesh whose convex hull is at most this much larger is one hull."""
+
+_MIN_PART = 2e-3
+"""Parts below this share of the total volume are slivers of the cutting planes and are dropped."""
+
+_COACD = {
+    "threshold": 0.05,
+    "max_convex_hull": MAX_HULLS,
+    "resolution": 1000,
+    "mcts_nodes": 15,
+    "mcts_iterations": 60,
+    "preprocess_resolution": 40,
+    "seed": 0,
+}
+"""Coarser than CoACD's defaults, three times as fast; on the paper's meshes the volumes differ by under 1 %."""
+
+
+def repair(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a copy with vertices merged, bad faces dropped, small holes filled and consistent outward winding.
+
+    Merging ignores texture coordinates and normals, along whose seams exported meshes are torn apart.
+    """
+    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    if len(mesh.faces) > MAX_FACES:
+        mesh = mesh.simplify_quadric_decimation(face_count=MAX_FACES)
+        mesh.merge_vertices()
+    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    mesh.remove_unreferenced_vertices()
+    mesh.fill_holes()
+    mesh.fix_normals()
+    return mesh
+
+
+def decompose(mesh: trimesh.Trimesh) -> tuple[np.ndarray, ...]:
+    """Cut a repaired mesh into convex parts.
+
+    Args:
+        mesh: in m, z up, standing on its lowest point.
+
+    Returns:
+        1 to `MAX_HULLS` arrays [P, 3] of at most 32 vertices, largest first, the base flat at z = 0.
+
+    Raises:
+        ValueError: nothing of the mesh has a volume.
+    """
+    vertices = np.asarray(mesh.vertices, np.float64)
+    if volume(vertices) <= _CONVEX_RATIO * mesh.volume:
+        parts = [vertices]
+    else:
+        watertight = mesh.is_watertight and mesh.body_count == 1
+        coacd.set_log_level("off")
+        found = coacd.run_coacd(
+            coacd.Mesh(vertices, mesh.faces), preprocess_mode="auto" if watertight else "on", **_COACD
+        )
+        parts = [part_vertices for part_vertices, _ in found]
+    return _solid_parts(flatten_base(parts))
+
+
+def flatten_base(parts: list[np.ndarray]) -> list[np.ndarray]:
+    """Stand the parts on z = 0 and move every vertex below `BASE_BAND` straight down onto it."""
+    lowest = min(part[:, 2].min() for part in parts)
+    flat = []
+    for part in parts:
+        part = part - [0.0, 0.0, lowest]
+        part[part[:, 2] < BASE_BAND, 2] = 0.0
+        flat.append(part)
+    return flat
+
+
+def _solid_parts(parts: list[np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Drop slivers, simplify the rest to the full topology, and put the largest first."""
+    volumes = np.array([volume(part) for part in parts])
+    if not volumes.any():
+        raise ValueError("the mesh encloses no volume")
+    order = np.argsort(-volumes, kind="stable")
+    keep = [i for i in order if volumes[i] > _MIN_PART * volumes.sum()]
+    return tuple(simplify(parts[i], FULL_TOPOLOGY[0], BASE_RING[FULL_TOPOLOGY]) for i in keep)
