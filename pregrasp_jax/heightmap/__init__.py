@@ -1,0 +1,37 @@
+"""Heightmaps: one rasterizer of convex hulls, two cameras, one network input for training and deployment."""
+
+from pregrasp_jax.heightmap.observation import (
+    SEGMENTATION,
+    fuse_segmentation,
+    network_input,
+    object_hulls,
+    observe,
+    overhead_camera,
+    robot_hulls,
+    scene_hulls,
+)
+from pregrasp_jax.heightmap.views import (
+    Camera,
+    HullInstances,
+    orthographic,
+    pinhole,
+    render_pinhole,
+    unproject,
+)
+
+__all__ = [
+    "SEGMENTATION",
+    "Camera",
+    "HullInstances",
+    "fuse_segmentation",
+    "network_input",
+    "object_hulls",
+    "observe",
+    "orthographic",
+    "overhead_camera",
+    "pinhole",
+    "render_pinhole",
+    "robot_hulls",
+    "scene_hulls",
+    "unproject",
+]
