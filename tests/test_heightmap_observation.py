@@ -1,0 +1,175 @@
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from heightmap_oracle import box_cloud, cast_rays, hull_planes, make_instances, pad, random_clouds
+
+from pregrasp_jax import grid, heightmap
+from pregrasp_jax.geometry import transform_points
+from pregrasp_jax.robot import description, home, kinematics
+from pregrasp_jax.types import (
+    FULL_TOPOLOGY,
+    MAX_HULLS,
+    MAX_OBJECTS,
+    ROBOT_ID,
+    HullBank,
+    Hulls,
+    Observation,
+    PhysicsObservation,
+    SceneParams,
+)
+
+
+@pytest.fixture(scope="module")
+def joints() -> jax.Array:
+    """An open hand in the middle of the workspace, 5 cm off the axis; one finger is less open than the other."""
+    hand_pose = jnp.array([0.05, -0.05, 0.1, 1.0, 0.0, 0.0, 0.0])
+    arm = kinematics.nearest_solution(kinematics.hand_inverse_kinematics(hand_pose), jnp.asarray(home.home_joints()))
+    return jnp.append(arm, jnp.array([home.FINGER_OPEN, 0.6 * home.FINGER_OPEN]))
+
+
+@pytest.fixture(scope="module")
+def bank() -> HullBank:
+    """Three objects of 1, 6 and 2 random hulls; only the arrays that drawing reads are filled."""
+    rng = np.random.default_rng(0)
+    counts = (1, MAX_HULLS, 2)
+    clouds = random_clouds(rng, sum(counts), spread=0.05)
+    full = Hulls(
+        vertices=jnp.asarray(np.stack([pad(c, FULL_TOPOLOGY[0]) for c in clouds]), jnp.float32),
+        planes=jnp.asarray(np.stack([pad(hull_planes(c), FULL_TOPOLOGY[1]) for c in clouds]), jnp.float32),
+        edges=jnp.zeros((len(clouds), FULL_TOPOLOGY[2], 2), jnp.int32),
+    )
+    hulls, start = -np.ones((3, MAX_HULLS), np.int32), 0
+    for i, count in enumerate(counts):
+        hulls[i, :count] = np.arange(start, start + count)
+        start += count
+    rest = {name: jnp.zeros(3) for name in ("mass", "com", "inertia", "inertia_quat", "friction", "height")}
+    rest |= {name: jnp.zeros(3) for name in ("min_width", "best_coverage", "eligible")}
+    return HullBank(
+        full=full, coarse=full, object_hulls=jnp.asarray(hulls), names=("a", "b", "c"), content_hash="", **rest
+    )
+
+
+def make_scene(key: jax.Array, object_ids: list[int], joints: jax.Array) -> tuple[SceneParams, PhysicsObservation]:
+    place, turn = jax.random.split(key)
+    quat = jax.random.normal(turn, (MAX_OBJECTS, 4))
+    pos = jax.random.uniform(place, (MAX_OBJECTS, 3), minval=-0.2, maxval=0.2) * jnp.array([[1.0, 1.0, 0.2]])
+    poses = jnp.concatenate([pos, quat / jnp.linalg.norm(quat, axis=1, keepdims=True)], axis=1)
+    # The scene's own poses are decoys: what is drawn is where the physics has put the objects.
+    scene = SceneParams(object_ids=jnp.array(object_ids), poses=poses[::-1] + 1.0, target=jnp.int32(0))
+    hand = jnp.array([0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0])
+    return scene, PhysicsObservation(object_poses=poses, joint_pos=joints, hand_pose=hand, diverged=jnp.bool(False))
+
+
+def test_scene_hulls_agree_with_mujoco_rays(bank, joints, key):
+    scene, physics_obs = make_scene(key, [2, -1, 1, 0, 2, -1, 1, -1], joints)
+    hulls = jax.jit(heightmap.scene_hulls)(bank, scene, physics_obs)
+    num_objects = MAX_OBJECTS * MAX_HULLS
+    assert [int(n) for n in hulls.present[:num_objects].reshape(MAX_OBJECTS, -1).sum(axis=1)] == [
+        2,
+        0,
+        6,
+        1,
+        2,
+        0,
+        6,
+        0,
+    ]
+    # Oracle: place the bank's own vertices one by one; hulls and rays are MuJoCo's.
+    clouds, labels = [], []
+    for slot, object_id in enumerate(scene.object_ids.tolist()):
+        for hull in bank.object_hulls[object_id].tolist() if object_id >= 0 else []:
+            if hull >= 0:
+                clouds.append(np.asarray(transform_points(physics_obs.object_poses[slot], bank.full.vertices[hull])))
+                labels.append(slot + 1)
+    for vertices in hulls.vertices[num_objects:]:
+        clouds.append(np.asarray(vertices))
+        labels.append(ROBOT_ID)
+    centers = np.asarray(grid.cell_centers(), np.float64)
+    x, y = np.meshgrid(centers, centers)
+    origins = np.stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)], axis=-1)
+    distance, expected = cast_rays(make_instances(clouds, labels), origins, np.tile([0.0, 0.0, -1.0], (x.size, 1)))
+    seen = (distance >= 0) & (distance < 2)
+    height, ids = heightmap.orthographic(hulls)
+    agree = np.asarray(ids).ravel() == np.where(seen, expected, 0)
+    assert agree.mean() >= 0.999
+    assert set(np.unique(ids)) >= {0, 1, 3, 5, 7, ROBOT_ID}
+    assert np.abs(np.asarray(height).ravel() - np.where(seen, 2 - distance, 0))[agree].max() < 5e-6
+
+
+def test_robot_is_drawn_where_mujoco_has_it(joints):
+    """Against the MJCF's own capsules and boxes, not their polyhedra: outlines differ by the capsule error."""
+    mj_model = description.robot_model()
+    mj_data = mujoco.MjData(mj_model)
+    mj_data.qpos[home.joint_qpos_ids(mj_model)] = joints
+    # The tips follow the drivers; without a step their mimic joints are set by hand.
+    for equality in range(mj_model.neq):
+        follower, leader = mj_model.eq_obj1id[equality], mj_model.eq_obj2id[equality]
+        ratio = mj_model.eq_data[equality, 1]
+        mj_data.qpos[mj_model.jnt_qposadr[follower]] = ratio * mj_data.qpos[mj_model.jnt_qposadr[leader]]
+    mujoco.mj_forward(mj_model, mj_data)
+    height, ids = jax.jit(lambda x: heightmap.orthographic(heightmap.robot_hulls(x)))(joints)
+    expected, geom_id = np.zeros((100, 100)), np.zeros(1, np.int32)
+    for row, y in enumerate(grid.cell_centers().tolist()):
+        for col, x in enumerate(grid.cell_centers().tolist()):
+            distance = mujoco.mj_ray(mj_model, mj_data, [x, y, 2.0], [0, 0, -1], None, 1, -1, geom_id)
+            expected[row, col] = 2 - distance if distance >= 0 else 0
+    drawn = expected > 1e-3
+    assert 0.05 < drawn.mean() < 0.9
+    assert ((np.asarray(ids) == ROBOT_ID) == drawn).mean() > 0.97
+    both = (np.asarray(ids) == ROBOT_ID) & drawn
+    assert np.median(np.abs(np.asarray(height) - expected)[both]) < 0.004
+
+
+def test_observe_quantizes_and_refuses_unknown_cameras(bank, key):
+    hulls = make_instances(
+        [box_cloud((0.05, 0.05, 0), (0.11, 0.11, 0.06)), box_cloud((0, 0, 0.4), (0.04, 0.04, 0.5))], [1, 2]
+    )
+    obs = heightmap.observe(hulls)
+    assert obs.height.dtype == obs.instance_ids.dtype == jnp.uint8
+    assert obs.height[65, 65] == 51 and obs.instance_ids[65, 65] == 1  # 0.06 m of 0.30 m in 255 steps
+    assert obs.height[54, 54] == 255 and obs.instance_ids[54, 54] == 2
+    through_pinhole = heightmap.observe(hulls, camera="pinhole")
+    # A surface at 0.5 m seen from 1 m stays over its own cells: its points are unprojected with their depth.
+    np.testing.assert_array_equal(through_pinhole.instance_ids[66:71, 66:71], 1)
+    np.testing.assert_array_equal(through_pinhole.instance_ids[51:57, 51:57], 2)
+    same = heightmap.observe(hulls, camera=heightmap.overhead_camera())
+    np.testing.assert_array_equal(same.height, through_pinhole.height)
+    with pytest.raises(ValueError, match="camera 'fisheye' is unknown; allowed are orthographic, pinhole"):
+        heightmap.observe(hulls, camera="fisheye")
+
+
+def test_overhead_camera_is_the_one_of_the_mjcf():
+    camera = heightmap.overhead_camera()
+    assert camera.shape == (480, 640)
+    np.testing.assert_allclose(camera.rotation, np.eye(3), atol=1e-6)
+    # A point is where MuJoCo's own camera frame puts it: +x right, +y up, row 0 on top.
+    point = make_instances([box_cloud((0.10, 0.15, 0), (0.102, 0.152, 0.001))], [1])
+    _, labels = heightmap.render_pinhole(point, camera)
+    rows, columns = np.nonzero(labels)
+    focal = 240 / np.tan(np.deg2rad(description.robot_model().camera("overhead").fovy.item()) / 2)
+    np.testing.assert_allclose(columns.mean() + 0.5, 320 + focal * 0.101, atol=0.5)
+    np.testing.assert_allclose(rows.mean() + 0.5, 240 - focal * 0.151, atol=0.5)
+
+
+def test_fused_segmentation_by_hand():
+    ids = jnp.array([[0, 1, 2], [8, 9, 3]], jnp.uint8)
+    np.testing.assert_array_equal(heightmap.fuse_segmentation(ids, jnp.int32(2)), [[0, 1, 1], [1, 3, 2]])
+    np.testing.assert_array_equal(heightmap.fuse_segmentation(ids, jnp.int32(0)), [[0, 2, 1], [1, 3, 1]])
+    np.testing.assert_array_equal(heightmap.fuse_segmentation(ids, jnp.int32(7)), [[0, 1, 1], [2, 3, 1]])
+
+
+def test_network_input_by_hand():
+    # Heights 0, 0, 0, 0.30 m: mean 0.075, standard deviation (of the population) 0.1299.
+    obs = Observation(
+        height=jnp.array([[0, 0], [0, 255]], jnp.uint8), instance_ids=jnp.array([[0, 9], [1, 2]], jnp.uint8)
+    )
+    image = heightmap.network_input(obs, jnp.int32(1))
+    np.testing.assert_allclose(image[..., 0], [[-0.57735, -0.57735], [-0.57735, 1.73205]], atol=1e-4)
+    np.testing.assert_allclose(image[..., 1], [[0, 1], [1 / 3, 2 / 3]], atol=1e-6)
+    flat = Observation(height=jnp.full((4, 4), 100, jnp.uint8), instance_ids=jnp.zeros((4, 4), jnp.uint8))
+    np.testing.assert_allclose(heightmap.network_input(flat, jnp.int32(0)), 0.0, atol=1e-4)
+    # Below the floor of 1 mm: one quantum of 1.18 mm in one of 16 cells has a deviation of 0.28 mm.
+    bump = heightmap.network_input(flat.replace(height=flat.height.at[0, 0].add(1)), jnp.int32(0))
+    np.testing.assert_allclose(bump[0, 0, 0], 15 / 16 * 0.30 / 255 / 1e-3, rtol=1e-3)
