@@ -1,0 +1,183 @@
+"""Evaluation by the paper's protocol (Sec. IV-A): fixed test scenes, ten pushes, one grasp.
+
+`num_envs` scenes run side by side and a scene that ends hands its place to the next one of the queue, so
+every scene runs to its end and no result depends on `num_envs`: keys derive from scene and push number.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import flax.struct as struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+
+from pregrasp_jax.env import Env
+from pregrasp_jax.judge import RUNNING, TARGET_IN_REGION
+from pregrasp_jax.policies import Policy
+from pregrasp_jax.primitives import APERTURE_TIME, SETTLE_TIME
+from pregrasp_jax.results import GRASP_FAILED, Episode, EvaluationResult
+from pregrasp_jax.types import REASONS, EnvState
+
+Progress = Callable[[int, int, int], None]
+"""(episodes ended, episodes in all, successes so far) -> None."""
+
+
+class _Run(struct.PyTreeNode):
+    """One scene under way; the last push that was executed left it as it is.
+
+    Attributes:
+        state: where it stands.
+        reason: () int32, `RUNNING` until the episode ends.
+        return_: () float32, rewards so far.
+        seconds: () float32 s, time spent on motions so far.
+    """
+
+    state: EnvState
+    reason: jax.Array
+    return_: jax.Array
+    seconds: jax.Array
+
+
+class Evaluator:
+    """Runs policies on the scenes of one environment; compiles once per kind of policy."""
+
+    def __init__(self, env: Env, *, num_envs: int = 16):
+        """Compile nothing yet.
+
+        Args:
+            env: the test (or validation) environment.
+            num_envs: scenes side by side; results do not depend on it.
+        """
+        self._env = env
+        self._num_envs = num_envs
+        self._start = jax.jit(jax.vmap(self._start_one))
+        self._restart = jax.jit(jax.vmap(self._restart_one))
+        self._push = jax.jit(jax.vmap(self._push_one, in_axes=(None, 0, None)))
+        self._grasp = jax.jit(jax.vmap(env.grasp))
+
+    def run(
+        self,
+        policy: Policy,
+        *,
+        episodes: int,
+        seed: int = 0,
+        with_grasp: bool = True,
+        progress: Progress | None = None,
+    ) -> EvaluationResult:
+        """Run scenes 0 to `episodes` - 1 to their ends.
+
+        Args:
+            policy: see `policies`.
+            episodes: at most the number of scenes.
+            seed: of the policy's own randomness; scenes, yaws and targets are fixed.
+            with_grasp: execute the grasp and count it; otherwise a target in the region is a success.
+            progress: told when episodes end.
+
+        Raises:
+            ValueError: more episodes than scenes, or none.
+        """
+        num_scenes = len(self._env.scenes)
+        if not 1 <= episodes <= num_scenes:
+            raise ValueError(f"episodes = {episodes} is out of range; this scene bank allows 1 to {num_scenes}")
+        finished: list[Episode] = []
+        enclosed: list[_Run] = []
+
+        def finish(episodes_now: list[Episode]) -> None:
+            finished.extend(episodes_now)
+            if progress and episodes_now:
+                progress(len(finished), episodes, sum(episode.success for episode in finished))
+
+        for run in self._run_to_ends(policy, episodes, jax.random.key(seed)):
+            if with_grasp and run.reason == TARGET_IN_REGION:
+                enclosed.append(run)
+            else:
+                finish([self._episode(run)])
+            if len(enclosed) == self._num_envs:
+                finish(self._grasp_all(enclosed))
+                enclosed.clear()
+        finish(self._grasp_all(enclosed))
+        return EvaluationResult(tuple(sorted(finished, key=lambda episode: episode.scene)))
+
+    def _run_to_ends(self, policy: Policy, episodes: int, key: jax.Array) -> Iterator[_Run]:
+        """Yield every scene when its pushes have ended, as host arrays."""
+        policy = policy if isinstance(policy, Partial) else Partial(policy)
+        num_envs = min(self._num_envs, episodes)
+        waiting = iter(range(num_envs, episodes))
+        runs = self._start(jnp.arange(num_envs))
+        busy = np.ones(num_envs, bool)
+        while busy.any():
+            runs = self._push(policy, runs, key)
+            ended = np.flatnonzero(busy & (np.asarray(runs.reason) != RUNNING))
+            if ended.size == 0:
+                continue
+            host = jax.device_get(runs)
+            yield from (jax.tree.map(lambda leaf, slot=slot: leaf[slot], host) for slot in ended)
+            following = np.full(num_envs, -1)
+            following[ended] = [next(waiting, -1) for _ in ended]
+            busy[ended] = following[ended] >= 0
+            runs = self._restart(runs, following)
+
+    def _grasp_all(self, runs: list[_Run]) -> list[Episode]:
+        """Execute the grasp in up to `num_envs` scenes; the batch is filled up with copies of the last."""
+        if not runs:
+            return []
+        padded = runs + runs[-1:] * (self._num_envs - len(runs))
+        held = self._grasp(jax.tree.map(lambda *leaves: np.stack(leaves), *(run.state for run in padded)))
+        return [self._episode(run, held=bool(ok)) for run, ok in zip(runs, np.asarray(held), strict=False)]
+
+    def _episode(self, run: _Run, *, held: bool = True) -> Episode:
+        scene = run.state.scene
+        return Episode(
+            scene=int(run.state.scene_index),
+            target=self._env.bank.names[int(scene.object_ids[scene.target])],
+            reason=REASONS[int(run.reason)] if held else GRASP_FAILED,
+            motions=int(run.state.num_pushes),
+            return_=float(run.return_),
+            seconds=float(run.seconds),
+        )
+
+    def _start_one(self, index: jax.Array) -> _Run:
+        return _Run(self._env.reset_to(index), jnp.int32(RUNNING), jnp.float32(0.0), jnp.float32(0.0))
+
+    def _restart_one(self, run: _Run, index: jax.Array) -> _Run:
+        """Return scene `index` if it is not negative, else `run`."""
+        return _where(index >= 0, self._start_one(jnp.maximum(index, 0)), run)
+
+    def _push_one(self, policy: Policy, run: _Run, key: jax.Array) -> _Run:
+        """Let the policy decide and push once; an ended run stays as it is."""
+        state = run.state
+        key = jax.random.fold_in(jax.random.fold_in(key, state.scene_index), state.num_pushes)
+        next_state, result = self._env.step(state, policy(state, key))
+        pushed = _Run(
+            next_state, result.reason, run.return_ + result.reward, run.seconds + self._seconds(state, next_state)
+        )
+        return _where(run.reason == RUNNING, pushed, run)
+
+    def _seconds(self, before: EnvState, after: EnvState) -> jax.Array:
+        """Return the time the robot took from one state to the next, s; 0 if the push was refused."""
+        travel = jnp.linalg.norm(after.p1 - before.p1) / self._env.task.push_speed
+        wait = APERTURE_TIME * (after.aperture != before.aperture)
+        return jnp.where(after.num_pushes > before.num_pushes, travel + wait + SETTLE_TIME, 0.0)
+
+
+def evaluate_policy(
+    env: Env,
+    policy: Policy,
+    *,
+    episodes: int,
+    seed: int = 0,
+    with_grasp: bool = True,
+    num_envs: int = 16,
+    progress: Progress | None = None,
+) -> EvaluationResult:
+    """Run one policy once; see `Evaluator.run`. Keep an `Evaluator` to run several without compiling again."""
+    return Evaluator(env, num_envs=num_envs).run(
+        policy, episodes=episodes, seed=seed, with_grasp=with_grasp, progress=progress
+    )
+
+
+def _where(condition: jax.Array, when: Any, otherwise: Any) -> Any:
+    """Select between two pytrees by one () bool."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), when, otherwise)

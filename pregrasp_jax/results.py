@@ -1,0 +1,185 @@
+"""Results of an evaluation: episodes, what follows from them, and the file that two runs are compared by."""
+
+import json
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pregrasp_jax import io
+from pregrasp_jax.config import Config, to_dict
+from pregrasp_jax.judge import TARGET_IN_REGION
+from pregrasp_jax.machine import versions
+from pregrasp_jax.statistics import wilson_interval
+from pregrasp_jax.types import REASONS
+
+FORMAT = "pregrasp_jax evaluation 1"
+"""Marks an evaluation file, so that a foreign JSON is not taken for one."""
+
+GRASP_FAILED = "grasp_failed"
+"""Reason of an episode whose target was in the closing region but not held; the others are `REASONS`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """How one scene went.
+
+    Attributes:
+        scene: row of the scene bank.
+        target: name of the target object.
+        reason: why it ended: `target_in_region` (and grasped, if a grasp was asked for), `grasp_failed`, or
+            another of `types.REASONS`.
+        motions: executed pushes; one that was refused as unreachable before the hand moved is not a motion.
+        return_: sum of rewards, undiscounted.
+        seconds: s, time the robot spent on its motions.
+    """
+
+    scene: int
+    target: str
+    reason: str
+    motions: int
+    return_: float
+    seconds: float
+
+    @property
+    def success(self) -> bool:
+        """Whether the episode counts as a success."""
+        return self.reason == REASONS[TARGET_IN_REGION]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the row of the evaluation file."""
+        return {
+            "scene": self.scene,
+            "target": self.target,
+            "reason": self.reason,
+            "success": self.success,
+            "motions": self.motions,
+            "return": round(self.return_, 4),
+            "seconds": round(self.seconds, 4),
+        }
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """Episodes, in scene order, and what follows from them."""
+
+    episodes: tuple[Episode, ...]
+
+    @property
+    def successes(self) -> int:
+        """Episodes that succeeded."""
+        return sum(episode.success for episode in self.episodes)
+
+    @property
+    def success_rate(self) -> float:
+        """Share of episodes that succeeded."""
+        return self.successes / len(self.episodes)
+
+    @property
+    def failures(self) -> dict[str, int]:
+        """Failed episodes by reason, most frequent first."""
+        return dict(Counter(episode.reason for episode in self.episodes if not episode.success).most_common())
+
+    def summary(self) -> dict[str, Any]:
+        """Return the measured keys of the evaluation file, without rows.
+
+        Motions are counted over successful episodes (Table I) and are None without one; their standard deviation is
+        that of these episodes, not an estimate for more of them. The robot's seconds per motion are over all motions.
+        """
+        total = len(self.episodes)
+        motions = [episode.motions for episode in self.episodes if episode.success]
+        executed = sum(episode.motions for episode in self.episodes)
+        return {
+            "success_rate": self.success_rate,
+            "success_ci95": list(wilson_interval(self.successes, total)),
+            "in_region_rate": (self.successes + self.failures.get(GRASP_FAILED, 0)) / total,
+            "mean_motions": float(np.mean(motions)) if motions else None,
+            "std_motions": float(np.std(motions)) if motions else None,
+            "mean_return": sum(episode.return_ for episode in self.episodes) / total,
+            "failures": self.failures,
+            "seconds_per_motion": sum(e.seconds for e in self.episodes) / executed if executed else None,
+        }
+
+
+def evaluation_document(
+    result: EvaluationResult,
+    *,
+    policy: str,
+    config: Config,
+    seed: int,
+    hull_bank_hash: str,
+    scene_bank_hash: str,
+    wall_seconds: float,
+) -> dict[str, Any]:
+    """Return the content of an evaluation file (`evaluate.py --json`).
+
+    Args:
+        result: what was measured.
+        policy: as the user named it.
+        config: what the environment was made from.
+        seed: of the policy's randomness.
+        hull_bank_hash: which objects.
+        scene_bank_hash: which scenes; two files can be paired only if both hashes agree.
+        wall_seconds: s, how long the evaluation took on this machine, compilation included.
+    """
+    return {
+        "format": FORMAT,
+        "policy": policy,
+        "physics": config.physics.engine,
+        "object_set": config.assets.object_set,
+        "camera": config.task.camera,
+        "episodes": len(result.episodes),
+        "seed": seed,
+        **result.summary(),
+        "wall_seconds": round(wall_seconds, 1),
+        "config_hash": io.content_hash(to_dict(config)),
+        "hull_bank_hash": hull_bank_hash,
+        "scene_bank_hash": scene_bank_hash,
+        "versions": versions(),
+        "config": to_dict(config),
+        "rows": [episode.to_dict() for episode in result.episodes],
+    }
+
+
+def load_evaluation(path: Path) -> dict[str, Any]:
+    """Read an evaluation file.
+
+    Raises:
+        ValueError: missing, not JSON, or not written by `evaluate.py --json`.
+    """
+    try:
+        document = json.loads(path.read_text())
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}; wanted a file written by evaluate.py --json") from None
+    except ValueError:
+        raise ValueError(f"{path}: not JSON; wanted a file written by evaluate.py --json") from None
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise ValueError(f"{path}: not an evaluation; wanted a file written by evaluate.py --json")
+    return document
+
+
+def format_evaluation(document: dict[str, Any]) -> str:
+    """Return the table that `evaluate.py` prints."""
+    low, high = document["success_ci95"]
+    title = f"{document['policy']} on {document['episodes']} {document['object_set']} scenes"
+    lines = {
+        "success": f"{document['success_rate']:.1%}   95 % interval {low:.1%} to {high:.1%}",
+        "target in region": f"{document['in_region_rate']:.1%}",
+        "motions": _spread(document["mean_motions"], document["std_motions"]),
+        "robot time": _maybe(document["seconds_per_motion"], "{:.2f} s per motion"),
+        "mean return": f"{document['mean_return']:.2f}",
+        "failures": ", ".join(f"{reason} {count}" for reason, count in document["failures"].items()) or "none",
+    }
+    settings = f"{document['physics']} physics, {document['camera']} camera, seed {document['seed']}"
+    rows = [f"  {name:<18}{text}" for name, text in lines.items()]
+    return "\n".join([f"{title} ({settings}, {document['wall_seconds']:.0f} s)", *rows])
+
+
+def _spread(mean: float | None, std: float | None) -> str:
+    return "no success to count" if mean is None else f"{mean:.2f} +- {std:.2f} per success"
+
+
+def _maybe(value: float | None, template: str) -> str:
+    return "no motion" if value is None else template.format(value)

@@ -1,0 +1,224 @@
+"""The evaluator against a plain loop over one scene at a time, and the file it writes against hand counts."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fake_env import FakeEnv, fake_env, make_scenes
+
+from pregrasp_jax import grid, policies, results
+from pregrasp_jax.config import Config, TaskConfig
+from pregrasp_jax.evaluation import Evaluator, evaluate_policy
+from pregrasp_jax.results import Episode, EvaluationResult
+from pregrasp_jax.types import OPEN, REASONS, EnvState
+
+ENV = fake_env()
+
+
+def _reference(env: FakeEnv, policy: policies.Policy, episodes: int, seed: int, with_grasp: bool) -> list[Episode]:
+    """One scene after the other, unbatched, from the definitions."""
+    step, policy, rows = jax.jit(env.step), jax.jit(policy), []
+    for scene in range(episodes):
+        state, motions, total, seconds = env.reset_to(jnp.int32(scene)), 0, 0.0, 0.0
+        scene_key = jax.random.fold_in(jax.random.key(seed), scene)
+        while True:
+            before = state
+            state, result = step(state, policy(state, jax.random.fold_in(scene_key, motions)))
+            total += float(result.reward)
+            if REASONS[int(result.reason)] != "unreachable":
+                motions += 1
+                seconds += float(np.linalg.norm(state.p1 - before.p1)) / env.task.push_speed + 0.25
+                seconds += 0.5 * bool(state.aperture != before.aperture)
+            if result.terminated or result.truncated:
+                break
+        reason = REASONS[int(result.reason)]
+        if reason == "target_in_region" and with_grasp and not env.grasp(state):
+            reason = "grasp_failed"
+        name = env.bank.names[env.scenes.object_ids[scene, env.scenes.target[scene]]]
+        rows.append(Episode(scene=scene, target=name, reason=reason, motions=motions, return_=total, seconds=seconds))
+    return rows
+
+
+def _assert_equal(result: EvaluationResult, expected: list[Episode]) -> None:
+    assert [dataclasses.replace(e, seconds=0.0) for e in result.episodes] == [
+        dataclasses.replace(e, seconds=0.0) for e in expected
+    ]
+    np.testing.assert_allclose([e.seconds for e in result.episodes], [e.seconds for e in expected], atol=1e-3)
+
+
+@pytest.mark.parametrize(("name", "with_grasp"), [("straight", True), ("clear", False), ("random", True)])
+def test_agrees_with_a_loop_over_single_scenes(name: str, with_grasp: bool) -> None:
+    policy = policies.SCRIPTS[name](ENV)
+    expected = _reference(ENV, policy, 12, 3, with_grasp)
+    _assert_equal(evaluate_policy(ENV, policy, episodes=12, seed=3, with_grasp=with_grasp, num_envs=5), expected)
+
+
+def test_reference_scenes_cover_what_matters() -> None:
+    reasons = {e.reason for e in evaluate_policy(ENV, policies.make_straight(ENV), episodes=12).episodes}
+    assert {"target_in_region", "grasp_failed"} <= reasons, reasons
+    reasons = {e.reason for e in evaluate_policy(ENV, policies.make_random(ENV), episodes=12).episodes}
+    assert {"obstacle_in_region", "truncated", "unreachable"} <= reasons, reasons
+
+
+def test_does_not_depend_on_num_envs() -> None:
+    policy = policies.make_random(ENV)
+    first, *others = (evaluate_policy(ENV, policy, episodes=11, seed=1, num_envs=n) for n in (1, 4, 32))
+    assert all(other == first for other in others)
+    assert [episode.scene for episode in first.episodes] == list(range(11))
+
+
+def test_seed_moves_only_the_policy() -> None:
+    random, straight = policies.make_random(ENV), policies.make_straight(ENV)
+    evaluator = Evaluator(ENV, num_envs=12)
+    assert evaluator.run(random, episodes=12, seed=0) != evaluator.run(random, episodes=12, seed=1)
+    assert evaluator.run(straight, episodes=12, seed=0) == evaluator.run(straight, episodes=12, seed=1)
+
+
+def _scene_far_away(pushes: int) -> FakeEnv:
+    """Return one scene whose target needs exactly `pushes` pushes along x: one onto the grid, then 40 mm each."""
+    scenes = make_scenes(1)
+    scenes.xy[:] = 0.24
+    scenes.xy[0, 1] = (-0.2475 + 0.04 * (pushes - 1), -0.0025)
+    scenes.target[0] = 1
+    return fake_env(scenes=scenes, task=TaskConfig(r_in=0.035, r_out=0.1))
+
+
+@pytest.mark.parametrize(("pushes", "reason"), [(1, "target_in_region"), (10, "target_in_region"), (12, "truncated")])
+def test_success_on_the_last_push_counts(pushes: int, reason: str) -> None:
+    env = _scene_far_away(pushes)
+
+    def crawl(state: EnvState, key: jax.Array) -> jax.Array:
+        del key
+        row, col = policies.nearest_cell(env.action_mask(state.p1), state.p1 + jnp.array([0.04, 0.0]))
+        return grid.encode_action(row, col, jnp.int32(OPEN))
+
+    (episode,) = evaluate_policy(env, crawl, episodes=1).episodes
+    assert (episode.reason, episode.motions) == (reason, min(pushes, 10))
+
+
+def test_a_refused_push_is_not_a_motion() -> None:
+    def step_then_dive(state: EnvState, key: jax.Array) -> jax.Array:
+        del key
+        row, col = policies.nearest_cell(ENV.action_mask(state.p1), jnp.array([-0.18, 0.0]))
+        return grid.encode_action(jnp.where(state.num_pushes < 1, row, 0), col, jnp.int32(0))
+
+    (episode,) = evaluate_policy(ENV, step_then_dive, episodes=1).episodes
+    assert (episode.reason, episode.motions) == ("unreachable", 1)
+    # One push of 0.12 m at 0.1 m/s, 0.25 s of settling and 0.5 s for closing the hand; nothing for the refusal.
+    assert episode.seconds == pytest.approx(1.2 + 0.75, abs=0.05)
+
+
+def test_progress_counts_every_episode_once() -> None:
+    calls: list[tuple[int, int, int]] = []
+    policy = policies.make_straight(ENV)
+    result = evaluate_policy(ENV, policy, episodes=12, num_envs=4, progress=lambda *args: calls.append(args))
+    assert [done for done, _, _ in calls] == sorted(done for done, _, _ in calls)
+    assert calls[-1] == (12, 12, result.successes)
+    # Progress never runs ahead of the grasp.
+    assert all(successes <= result.successes for _, _, successes in calls)
+
+
+def test_new_parameters_do_not_compile_again() -> None:
+    traces = []
+
+    def q_values(params: jax.Array, images: jax.Array) -> jax.Array:
+        traces.append(1)
+        return params * images
+
+    make = policies.make_learned(ENV, q_values, lambda obs, target: jnp.ones((*obs.height.shape, 2)))
+    evaluator = Evaluator(ENV, num_envs=3)
+    for scale in (1.0, 2.0):
+        evaluator.run(make(jnp.float32(scale)), episodes=5)
+    assert len(traces) == 1
+
+
+@pytest.mark.parametrize("episodes", [0, 13])
+def test_refuses_more_episodes_than_scenes(episodes: int) -> None:
+    with pytest.raises(ValueError, match=f"episodes = {episodes} is out of range; this scene bank allows 1 to 12"):
+        evaluate_policy(ENV, policies.make_straight(ENV), episodes=episodes)
+
+
+def _episode(scene: int, reason: str, motions: int, seconds: float = 1.0) -> Episode:
+    return Episode(scene=scene, target="can", reason=reason, motions=motions, return_=2.0, seconds=seconds)
+
+
+RESULT = EvaluationResult(
+    (
+        _episode(0, "target_in_region", 2),
+        _episode(1, "target_in_region", 5),
+        _episode(2, "grasp_failed", 10, 7.0),
+        _episode(3, "off_table", 3),
+        _episode(4, "grasp_failed", 0, 0.0),
+    )
+)
+
+
+def _document(result: EvaluationResult = RESULT, policy: str = "clear") -> dict:
+    return results.evaluation_document(
+        result,
+        policy=policy,
+        config=Config(),
+        seed=4,
+        hull_bank_hash="h",
+        scene_bank_hash="s",
+        wall_seconds=12.34,
+    )
+
+
+def test_summary_by_hand() -> None:
+    document = _document()
+    assert document["success_rate"] == 0.4
+    assert document["in_region_rate"] == 0.8
+    # Over the two successes only; over all five it would be 4.0.
+    assert document["mean_motions"] == 3.5
+    assert document["std_motions"] == 1.5
+    assert document["failures"] == {"grasp_failed": 2, "off_table": 1}
+    assert document["seconds_per_motion"] == 10.0 / 20
+    assert document["mean_return"] == 2.0
+    assert document["rows"][3] == {
+        "scene": 3,
+        "target": "can",
+        "reason": "off_table",
+        "success": False,
+        "motions": 3,
+        "return": 2.0,
+        "seconds": 1.0,
+    }
+
+
+def test_document_says_what_was_run(tmp_path: Path) -> None:
+    document = _document()
+    assert {k: document[k] for k in ("policy", "physics", "object_set", "camera", "episodes", "seed")} == {
+        "policy": "clear",
+        "physics": "native",
+        "object_set": "seen",
+        "camera": "orthographic",
+        "episodes": 5,
+        "seed": 4,
+    }
+    assert document["versions"]["mujoco"] and document["config_hash"]
+    path = tmp_path / "e.json"
+    path.write_text(json.dumps(document))
+    assert results.load_evaluation(path) == document
+    text = results.format_evaluation(document)
+    assert "40.0%" in text and "grasp_failed 2, off_table 1" in text and "3.50 +- 1.50" in text
+
+
+def test_nothing_succeeded() -> None:
+    document = _document(EvaluationResult((_episode(0, "unreachable", 0),)))
+    assert document["mean_motions"] is None and document["seconds_per_motion"] is None
+    json.dumps(document, allow_nan=False)
+    assert "no success" in results.format_evaluation(document)
+
+
+@pytest.mark.parametrize("content", [None, "not json", "[]", '{"format": "something else"}'])
+def test_load_refuses_foreign_files(tmp_path: Path, content: str | None) -> None:
+    path = tmp_path / "e.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(ValueError, match=r"e\.json: .*evaluate\.py --json"):
+        results.load_evaluation(path)

@@ -1,0 +1,191 @@
+"""Policies against brute force on the grid and hand-made worlds."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fake_env import UNREACHABLE_ROWS, fake_env, make_scenes
+
+from pregrasp_jax import grid, policies
+from pregrasp_jax.judge import TARGET_IN_REGION
+from pregrasp_jax.types import CLOSED, OPEN, REASONS, EnvState, Observation
+
+ENV = fake_env()
+
+
+def _state(p1: tuple[float, float], target: tuple[float, float]) -> EnvState:
+    state = ENV.reset_to(0)
+    # Every other object sits elsewhere: a policy that aims at the wrong slot is caught.
+    centroids = jnp.full((8, 2), -0.2).at[state.scene.target].set(jnp.array(target))
+    return state.replace(p1=jnp.array(p1), centroids=centroids)
+
+
+def _end(action: jax.Array) -> tuple[np.ndarray, int]:
+    row, col, aperture = grid.decode_action(action)
+    return np.asarray(grid.cell_to_world(row, col)), int(aperture)
+
+
+def test_straight_ends_on_a_target_in_reach(key: jax.Array) -> None:
+    # Neither on the diagonal nor at the centre: swapped rows and columns miss it.
+    end, aperture = _end(policies.make_straight(ENV)(_state((-0.1, -0.1), (-0.0525, 0.0125)), key))
+    np.testing.assert_allclose(end, [-0.0525, 0.0125], atol=1e-6)
+    assert aperture == OPEN
+
+
+@pytest.mark.parametrize("target", [(0.15, 0.02), (0.0, -0.22), (-0.22, 0.1), (-0.295, 0.01), (-0.2, -0.01)])
+@pytest.mark.parametrize("p1", [(-0.3, 0.0), (-0.1975, 0.0525)])
+def test_straight_ends_in_the_half_ring_nearest_to_the_target(
+    p1: tuple[float, float], target: tuple[float, float], key: jax.Array
+) -> None:
+    end, _ = _end(policies.make_straight(ENV)(_state(p1, target), key))
+    axis = -0.25 + 0.005 * (np.arange(100) + 0.5)
+    cells = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    radius = np.linalg.norm(cells - p1, axis=1)
+    ring = cells[(radius >= 0.04 - 1e-6) & (radius <= 0.15 + 1e-6) & (cells[:, 0] >= p1[0] - 1e-6)]
+    best = np.linalg.norm(ring - target, axis=1).min()
+    assert np.linalg.norm(end - target) == pytest.approx(best, abs=1e-5)
+    assert np.linalg.norm(ring - end, axis=1).min() < 1e-5
+
+
+@pytest.mark.parametrize(("distance", "aperture"), [(0.129, OPEN), (0.131, CLOSED), (0.05, OPEN), (0.3, CLOSED)])
+def test_clear_opens_near_the_target(distance: float, aperture: int, key: jax.Array) -> None:
+    direction = np.array([0.6, 0.8])
+    p1 = (-0.1, -0.1)
+    target = tuple(float(x) for x in np.asarray(p1) + distance * direction)
+    state = _state(p1, (target[0], target[1]))
+    end, chosen = _end(policies.make_clear(ENV)(state, key))
+    assert chosen == aperture
+    np.testing.assert_allclose(end, _end(policies.make_straight(ENV)(state, key))[0])
+
+
+def test_random_is_uniform_in_the_half_ring(key: jax.Array) -> None:
+    state = _state((-0.1, 0.0), (0.1, 0.1))
+    keys = jax.random.split(key, 600)
+    actions = jax.jit(jax.vmap(policies.make_random(ENV), (None, 0)))(state, keys)
+    row, col, aperture = (np.asarray(x) for x in grid.decode_action(actions))
+    mask = np.asarray(ENV.action_mask(state.p1))
+    assert mask[row, col].all()
+    assert abs(aperture.mean() - 0.5) < 0.07
+    # Uniform over cells, not over radius or angle: a cell's expected position is the mask's centroid.
+    expected = np.argwhere(mask).mean(axis=0)
+    np.testing.assert_allclose([row.mean(), col.mean()], expected, atol=3.0)
+    assert len(set(zip(row, col, strict=True))) > 400
+
+
+def test_guided_heads_for_the_target(key: jax.Array) -> None:
+    state = _state((-0.1, 0.0), (0.0, 0.1))
+    actions = jax.jit(jax.vmap(policies.make_guided(ENV), (None, 0)))(state, jax.random.split(key, 500))
+    row, col, aperture = grid.decode_action(actions)
+    offset = np.asarray(grid.cell_to_world(row, col)) - np.array([-0.1, 0.0])
+    angle = np.arctan2(offset[:, 1], offset[:, 0])
+    assert angle.mean() == pytest.approx(np.pi / 4, abs=0.1)
+    assert float(aperture.mean()) == pytest.approx(0.7, abs=0.07)
+
+
+def test_learned_takes_the_best_allowed_pixel(key: jax.Array) -> None:
+    state = _state((-0.1, 0.0), (0.0, 0.1))
+    inside, outside = grid.world_to_cell(jnp.array([[0.0, 0.0], [-0.2, 0.0]])), (7, 93)
+    rows, cols = inside
+    q = jnp.full((100, 100, 2), -5.0)
+    q = q.at[rows[1], cols[1], 1].set(9.0).at[outside[0], outside[1], 0].set(8.0)
+    q = q.at[rows[0], cols[0], 1].set(-1.0).at[rows[0], cols[0], 0].set(-2.0)
+    make = policies.make_learned(ENV, lambda params, images: params + 0 * images, _blank_input)
+    chosen = make(q)(state, key)
+    assert chosen == grid.encode_action(rows[0], cols[0], jnp.int32(OPEN))
+
+
+def _blank_input(obs: Observation, target: jax.Array) -> jax.Array:
+    return jnp.zeros((*obs.height.shape, 2)) + target
+
+
+def test_learned_sees_its_own_target(key: jax.Array) -> None:
+    cell = grid.world_to_cell(jnp.array([0.0, 0.0]))
+    state = _state((-0.1, 0.0), (0.0, 0.1))
+
+    def q_values(params: jax.Array, images: jax.Array) -> jax.Array:
+        wanted = jnp.zeros((100, 100, 2)).at[cell[0], cell[1], 0].set(1.0)
+        return params * wanted * (images[0, 0, 0] == state.scene.target)
+
+    action = policies.make_learned(ENV, q_values, _blank_input)(jnp.float32(1.0))(state, key)
+    assert action == grid.encode_action(*cell, jnp.int32(CLOSED))
+
+
+def test_policies_of_one_constructor_share_their_compilation(key: jax.Array) -> None:
+    traces = []
+
+    def q_values(params: jax.Array, images: jax.Array) -> jax.Array:
+        traces.append(1)
+        return params * images
+
+    make = policies.make_learned(ENV, q_values, _blank_input)
+    decide = jax.jit(lambda policy, state, key: policy(state, key))
+    for scale in (1.0, 2.0, 3.0):
+        decide(make(jnp.float32(scale)), ENV.reset_to(0), key)
+    assert len(traces) == 1
+
+
+def _world(xy: list[tuple[float, float]]) -> Any:
+    scenes = make_scenes(1)
+    scenes.xy[0, :3] = xy
+    scenes.target[0] = 1
+    env = fake_env(scenes=scenes)
+    return env
+
+
+def test_lookahead_succeeds_where_straight_encloses_the_obstacle(key: jax.Array) -> None:
+    # The obstacle sits exactly where the first straight push ends.
+    env = _world([(-0.1525, 0.0025), (0.0, 0.0), (0.2, 0.2)])
+    state, result = env.step(env.reset_to(0), policies.make_straight(env)(env.reset_to(0), key))
+    assert REASONS[int(result.reason)] == "obstacle_in_region"
+    lookahead, step = jax.jit(policies.make_lookahead(env)), jax.jit(env.step)
+    for episode in range(5):
+        state = env.reset_to(0)
+        for push in range(3):
+            state, result = step(state, lookahead(state, jax.random.key(10 * episode + push)))
+            if result.terminated:
+                break
+        assert int(result.reason) == TARGET_IN_REGION
+
+
+def test_lookahead_never_takes_a_failure_if_a_candidate_survives(key: jax.Array) -> None:
+    env = _world([(-0.2, 0.2), (0.24, -0.24), (0.2, 0.2)])
+    # Near the lower edge a large share of the half ring is out of reach, and the target attracts there.
+    state = env.reset_to(0).replace(p1=jnp.array([0.05, -0.2025]))
+    choose = jax.jit(jax.vmap(policies.make_lookahead(env), (None, 0)))
+    rows, _, _ = grid.decode_action(choose(state, jax.random.split(key, 6)))
+    assert (rows >= UNREACHABLE_ROWS).all()
+    guided, _, _ = grid.decode_action(jax.vmap(policies.make_guided(env), (None, 0))(state, jax.random.split(key, 50)))
+    assert (guided < UNREACHABLE_ROWS).any(), "the test must offer failures"
+
+
+def test_lookahead_ranks_success_then_distance_then_failure() -> None:
+    env = _world([(-0.1525, 0.0025), (-0.2025, 0.0525), (0.2, 0.2)])
+
+    def value(xy: tuple[float, float], aperture: int, depth: int) -> float:
+        row, col = grid.world_to_cell(jnp.array(xy))
+        action = grid.encode_action(row, col, jnp.int32(aperture))
+        return float(policies._push(env, env.reset_to(0), action, depth)[1])
+
+    success, near, far = (-0.2025, 0.0525), (-0.2025, 0.0425), (-0.2025, -0.05)
+    failure = (-0.1525, 0.0025)
+    ranked = [
+        value(success, OPEN, 0),
+        value(success, OPEN, 2),
+        value(near, CLOSED, 2),
+        value(far, CLOSED, 0),
+        value(failure, OPEN, 2),
+        value(failure, OPEN, 0),
+    ]
+    assert ranked == sorted(ranked, reverse=True)
+    assert len(set(ranked)) == len(ranked)
+
+
+def test_every_script_runs_unbatched_under_jit(key: jax.Array) -> None:
+    state = ENV.reset_to(3)
+    for make in policies.SCRIPTS.values():
+        action = jax.jit(make(ENV))(state, key)
+        row, col, _ = grid.decode_action(action)
+        assert action.dtype == jnp.int32 and action.shape == ()
+        assert ENV.action_mask(state.p1)[row, col]
