@@ -3,12 +3,13 @@
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fake_env import FakeEnv, fake_env, make_scenes
+from fake_env import fake_env, make_scenes
 
 from pregrasp_jax import grid, policies, results
 from pregrasp_jax.config import Config, TaskConfig
@@ -19,7 +20,7 @@ from pregrasp_jax.types import OPEN, REASONS, EnvState
 ENV = fake_env()
 
 
-def _reference(env: FakeEnv, policy: policies.Policy, episodes: int, seed: int, with_grasp: bool) -> list[Episode]:
+def _reference(env: Any, policy: policies.Policy, episodes: int, seed: int, with_grasp: bool) -> list[Episode]:
     """One scene after the other, unbatched, from the definitions."""
     step, policy, rows = jax.jit(env.step), jax.jit(policy), []
     for scene in range(episodes):
@@ -78,7 +79,7 @@ def test_seed_moves_only_the_policy() -> None:
     assert evaluator.run(straight, episodes=12, seed=0) == evaluator.run(straight, episodes=12, seed=1)
 
 
-def _scene_far_away(pushes: int) -> FakeEnv:
+def _scene_far_away(pushes: int) -> Any:
     """Return one scene whose target needs exactly `pushes` pushes along x: one onto the grid, then 40 mm each."""
     scenes = make_scenes(1)
     scenes.xy[:] = 0.24
