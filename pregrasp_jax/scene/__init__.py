@@ -1,0 +1,1 @@
+"""Slots, packing and scene banks: from objects to tightly packed scenes."""

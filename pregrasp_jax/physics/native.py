@@ -1,0 +1,211 @@
+"""The `native` engine: MuJoCo's C engine on CPU threads, reached by one host callback per push.
+
+`mujoco.batch.Batch` keeps model fields per simulation, so the callback compares the objects that a scene
+wants with those that are loaded and rewrites only what differs. The dynamic state travels through JAX as
+pairs of uint32 (the bits of MuJoCo's float64), so that x64 stays off and nothing is rounded.
+"""
+
+import functools
+import threading
+from typing import Any
+
+import flax.struct as struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+
+from pregrasp_jax.physics.base import CTRL_DT, MAX_SPEED, NUM_CONTROLS, Engine
+from pregrasp_jax.robot import description, home
+from pregrasp_jax.robot.kinematics import grasp_pose
+from pregrasp_jax.scene import model as slot_model
+from pregrasp_jax.scene.model import SlotModel
+from pregrasp_jax.types import MAX_OBJECTS, HullBank, PhysicsObservation, SceneParams
+
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+class NativeState(struct.PyTreeNode):
+    """Everything MuJoCo integrates, and what it looks like from outside.
+
+    Attributes:
+        bits: [2 * nstate] uint32, mjSTATE_INTEGRATION as pairs.
+        object_ids: [MAX_OBJECTS] int32.
+        object_poses: [MAX_OBJECTS, 7] float32.
+        joint_pos: [8] float32 rad.
+        diverged: () bool.
+    """
+
+    bits: jax.Array
+    object_ids: jax.Array
+    object_poses: jax.Array
+    joint_pos: jax.Array
+    diverged: jax.Array
+
+
+class Simulations:
+    """A `Batch` that grows to the number of scenes it is asked for, with the objects loaded in each.
+
+    Not for concurrent use by several owners: a lock serialises calls, and evaluation makes its own engine.
+    """
+
+    def __init__(self, model: SlotModel, *, threads: int = 0):
+        self.model = model
+        self.num_substeps = round(CTRL_DT / model.mj_model.opt.timestep)
+        self._threads = threads
+        self._lock = threading.Lock()
+        self._joint_ids = home.joint_qpos_ids(model.mj_model)
+        self._allocate(1)
+
+    def _allocate(self, num_scenes: int) -> None:
+        self._batch = Batch(self.model.mj_model, num_scenes, self._threads)
+        names = (*slot_model.GEOM_FIELDS, *slot_model.BODY_FIELDS, slot_model.RBOUND)
+        self._expanded = {name: self._batch.expand(name) for name in names}
+        self._loaded = np.full((num_scenes, MAX_OBJECTS), -1)
+
+    @property
+    def state_size(self) -> int:
+        """Length of one mjSTATE_INTEGRATION row."""
+        return self._batch.nstate
+
+    def load(self, object_ids: np.ndarray) -> None:
+        """Put objects [E, MAX_OBJECTS] into the slots of the first E simulations, where they differ."""
+        if len(object_ids) > self._batch.nsim:
+            self._allocate(len(object_ids))
+        sims = np.flatnonzero((self._loaded[: len(object_ids)] != object_ids).any(axis=1))
+        if sims.size == 0:
+            return
+        wanted = object_ids[sims]
+        slot_model.write_batch_slots(self.model, self._expanded, sims, wanted)
+        self._batch.set_const(sims)
+        slot_model.write_batch_fields(self.model, self._expanded, sims, wanted, [slot_model.RBOUND])
+        self._loaded[sims] = wanted
+
+    def run(self, state: np.ndarray, object_ids: np.ndarray, ctrl: np.ndarray, num_ctrl: np.ndarray) -> Any:
+        """Advance E scenes by `num_ctrl` control rows each; scenes that are through leave the stepped set.
+
+        Args:
+            state: [E, nstate] float64.
+            object_ids: [E, MAX_OBJECTS] int32.
+            ctrl: [E, T, NUM_CONTROLS] rad.
+            num_ctrl: [E] int, at most T.
+
+        Returns:
+            The new state [E, nstate] and diverged [E] bool.
+        """
+        with self._lock:
+            self.load(object_ids)
+            batch, num_scenes = self._batch, len(state)
+            batch.state[:num_scenes] = state
+            batch.warning[:num_scenes] = 0
+            fine = _interpolate(ctrl, self.num_substeps)
+            failed = np.zeros(num_scenes, bool)
+            start = 0
+            for stop in np.unique(num_ctrl[num_ctrl > 0]):
+                ids = np.flatnonzero(num_ctrl >= stop)
+                rows = slice(start * self.num_substeps, stop * self.num_substeps)
+                try:
+                    batch.rollout(rows.stop - rows.start, fine[ids, rows], record=(), ids=ids)
+                except SimulationError as error:
+                    failed[error.ids] = True
+                start = stop
+            new_state = batch.state[:num_scenes].copy()
+            speed = np.abs(batch.bind("qvel")[:num_scenes]).max(axis=1)
+            warned = batch.warning[:num_scenes].any(axis=(1, 2))
+        return new_state, failed | warned | ~(speed < MAX_SPEED) | ~np.isfinite(new_state).all(axis=1)
+
+    def describe(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return object poses [E, MAX_OBJECTS, 7] and joint positions [E, 8] float32 of states [E, nstate]."""
+        offset, size = self._batch._component(mujoco.mjtState.mjSTATE_QPOS)
+        qpos = state[:, offset : offset + size].astype(np.float32)
+        return qpos[:, self.model.slot_qpos_ids], qpos[:, self._joint_ids]
+
+    def initial_state(self, object_poses: np.ndarray) -> np.ndarray:
+        """Return states [E, nstate] with objects at rest at poses [E, MAX_OBJECTS, 7] and the robot at the start."""
+        mj_model, data = self.model.mj_model, mujoco.MjData(self.model.mj_model)
+        home.set_home(mj_model, data)
+        template = np.zeros(self.state_size)
+        mujoco.mj_getState(mj_model, data, template, _STATE)
+        state = np.repeat(template[None], len(object_poses), axis=0)
+        offset, _ = self._batch._component(mujoco.mjtState.mjSTATE_QPOS)
+        state[:, offset + self.model.slot_qpos_ids] = object_poses
+        return state
+
+
+def _interpolate(ctrl: np.ndarray, num_substeps: int) -> np.ndarray:
+    """Return [E, T * num_substeps, nu] float64: the control of every physics step, linear between the rows."""
+    ctrl = ctrl.astype(np.float64)
+    following = np.concatenate([ctrl[:, 1:], ctrl[:, -1:]], axis=1)
+    share = (np.arange(num_substeps) / num_substeps)[:, None]
+    fine = ctrl[:, :, None] + share * (following - ctrl)[:, :, None]
+    return fine.reshape(len(ctrl), -1, ctrl.shape[-1])
+
+
+def _to_bits(state: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(state).view(np.uint32)
+
+
+def _from_bits(bits: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(bits).view(np.float64)
+
+
+def make_engine(bank: HullBank, *, threads: int = 0) -> Engine:
+    """Compile the slot model of `bank` and return the engine; it owns its simulations.
+
+    Args:
+        bank: host hull bank.
+        threads: 0 takes every core; results do not depend on it.
+    """
+    simulations = Simulations(slot_model.make_slot_model(description.load_spec(), bank), threads=threads)
+    shapes = NativeState(
+        bits=jax.ShapeDtypeStruct((2 * simulations.state_size,), jnp.uint32),
+        object_ids=jax.ShapeDtypeStruct((MAX_OBJECTS,), jnp.int32),
+        object_poses=jax.ShapeDtypeStruct((MAX_OBJECTS, 7), jnp.float32),
+        joint_pos=jax.ShapeDtypeStruct((8,), jnp.float32),
+        diverged=jax.ShapeDtypeStruct((), jnp.bool_),
+    )
+
+    def package(state: np.ndarray, object_ids: np.ndarray, diverged: np.ndarray, batch: tuple[int, ...]) -> NativeState:
+        object_poses, joint_pos = simulations.describe(state)
+        flat = NativeState(_to_bits(state), object_ids.astype(np.int32), object_poses, joint_pos, diverged)
+        return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), flat)
+
+    def host_reset(object_ids: Any, poses: Any) -> NativeState:
+        object_ids, poses = np.asarray(object_ids), np.asarray(poses)
+        batch = object_ids.shape[:-1]
+        object_ids = object_ids.reshape(-1, MAX_OBJECTS)
+        state = simulations.initial_state(poses.reshape(-1, MAX_OBJECTS, 7))
+        return package(state, object_ids, np.zeros(len(state), bool), batch)
+
+    def host_run(state: Any, ctrl: Any, num_ctrl: Any) -> NativeState:
+        batch = np.shape(num_ctrl)
+        bits, object_ids, was_diverged = (
+            np.asarray(x).reshape(-1, *np.shape(x)[len(batch) :])
+            for x in (state.bits, state.object_ids, state.diverged)
+        )
+        ctrl = np.asarray(ctrl).reshape(-1, *np.shape(ctrl)[-2:])
+        num_ctrl = np.where(was_diverged, 0, np.asarray(num_ctrl).reshape(-1))
+        new_state, diverged = simulations.run(_from_bits(bits), object_ids, ctrl, num_ctrl)
+        return package(new_state, object_ids, diverged | was_diverged, batch)
+
+    callback = functools.partial(jax.pure_callback, vmap_method="broadcast_all")
+
+    def reset(state: NativeState, scene: SceneParams) -> NativeState:
+        del state
+        return callback(host_reset, shapes, scene.object_ids, scene.poses)
+
+    def init() -> NativeState:
+        poses = jnp.asarray(slot_model.parking_poses(), jnp.float32)
+        empty = SceneParams(jnp.full(MAX_OBJECTS, -1, jnp.int32), poses, jnp.int32(0))
+        return callback(host_reset, shapes, empty.object_ids, empty.poses)
+
+    def run(state: NativeState, ctrl: jax.Array, num_ctrl: jax.Array) -> NativeState:
+        if ctrl.shape[-1] != NUM_CONTROLS:
+            raise ValueError(f"ctrl must have {NUM_CONTROLS} columns, got {ctrl.shape[-1]}")
+        return callback(host_run, shapes, state, ctrl, num_ctrl)
+
+    def observe(state: NativeState) -> PhysicsObservation:
+        return PhysicsObservation(state.object_poses, state.joint_pos, grasp_pose(state.joint_pos[:6]), state.diverged)
+
+    return Engine("native", init, reset, run, observe)

@@ -1,0 +1,56 @@
+"""A stage imports only stages before it in the data flow."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import pregrasp_jax
+
+PACKAGE = Path(pregrasp_jax.__file__).parent
+ORDER = [
+    ["io", "types"],
+    ["config", "geometry", "grid", "judge"],
+    ["assets"],
+    ["robot"],
+    ["scene"],
+    ["physics"],
+    ["heightmap"],
+    ["primitives"],
+    ["env"],
+    ["learning"],
+    ["exploration", "statistics", "drawing"],
+    ["policies"],
+    ["evaluation"],
+    ["checkpoint"],
+    ["training"],
+    ["report"],
+    ["cli", "__main__"],
+]
+RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
+
+
+def stage(module: str) -> str:
+    return module.removeprefix("pregrasp_jax.").split(".")[0]
+
+
+def imported_stages(path: Path) -> set[str]:
+    stages = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module == "pregrasp_jax":
+            stages |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("pregrasp_jax."):
+            stages.add(stage(node.module or ""))
+        elif isinstance(node, ast.Import):
+            stages |= {stage(a.name) for a in node.names if a.name.startswith("pregrasp_jax.")}
+    return stages - {"__version__"}
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_go_one_way(path: Path):
+    own = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    if own == "__init__":
+        assert not imported_stages(path)
+        return
+    for other in imported_stages(path):
+        assert other == own or RANK[other] < RANK[own], f"{own} imports {other}, which comes later"

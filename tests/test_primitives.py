@@ -1,0 +1,112 @@
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pregrasp_jax import grid, primitives
+from pregrasp_jax.physics.base import CTRL_DT
+from pregrasp_jax.robot import home, kinematics
+from pregrasp_jax.types import CLOSED, OPEN
+
+SPEED = 0.1
+NUM_ROWS = primitives.num_push_rows(0.15, SPEED)
+
+
+def plan(start, end, before=OPEN, after=OPEN):
+    joints = jnp.asarray(home.home_joints())
+    return primitives.plan_push(
+        joints,
+        jnp.asarray(start, jnp.float32),
+        jnp.asarray(end, jnp.float32),
+        jnp.int32(before),
+        jnp.int32(after),
+        push_speed=SPEED,
+        num_rows=NUM_ROWS,
+    )
+
+
+def loop_mask(p1, r_in, r_out, full):
+    mask = np.zeros((100, 100), bool)
+    for row in range(100):
+        for col in range(100):
+            x, y = -0.25 + 0.005 * (col + 0.5), -0.25 + 0.005 * (row + 0.5)
+            r, theta = np.hypot(x - p1[0], y - p1[1]), np.arctan2(y - p1[1], x - p1[0])
+            ahead = full or abs(theta) <= np.pi / 2 + 1e-6
+            mask[row, col] = ahead and r_in - 1e-6 <= r <= r_out + 1e-6
+    return mask
+
+
+@pytest.mark.parametrize("full", [False, True])
+@pytest.mark.parametrize("p1", [(-0.30, 0.0), (0.0025, 0.0025), (0.2475, -0.2475), (0.4, 0.0)])
+def test_half_ring_is_the_loop_over_cells(p1, full):
+    mask = primitives.half_ring_mask(jnp.array(p1), r_in=0.04, r_out=0.15, full_ring=full)
+    np.testing.assert_array_equal(mask, loop_mask(p1, 0.04, 0.15, full))
+
+
+def test_half_ring_ends_are_inclusive():
+    p1 = grid.cell_to_world(jnp.int32(50), jnp.int32(20))
+    mask = primitives.half_ring_mask(p1, r_in=0.04, r_out=0.15)
+    assert mask[50, 28] and not mask[50, 27], "r_in = 8 cells straight ahead"
+    assert mask[50, 50] and not mask[50, 51], "r_out = 30 cells straight ahead"
+    assert mask[80, 20] and mask[20, 20] and not mask[80, 19], "exactly sideways belongs to it, backward does not"
+
+
+def test_half_ring_is_mirror_symmetric():
+    up = primitives.half_ring_mask(jnp.array([-0.1, 0.03]), r_in=0.04, r_out=0.15)
+    down = primitives.half_ring_mask(jnp.array([-0.1, -0.03]), r_in=0.04, r_out=0.15)
+    np.testing.assert_array_equal(up, down[::-1])
+
+
+def test_minimum_jerk_meets_its_boundary_conditions():
+    np.testing.assert_allclose(primitives.minimum_jerk(jnp.array([-1.0, 0.0, 0.5, 1.0, 2.0])), [0, 0, 0.5, 1, 1])
+    velocity = jax.vmap(jax.grad(primitives.minimum_jerk))(jnp.array([1e-3, 0.5, 1 - 1e-3]))
+    np.testing.assert_allclose(velocity, [0, 1.875, 0], atol=1e-4)
+
+
+def test_push_times_and_fingers():
+    kept = plan((-0.3, 0.0), (-0.2, 0.0))
+    changed = plan((-0.3, 0.0), (-0.2, 0.0), OPEN, CLOSED)
+    assert kept.num_ctrl == math.ceil((1.0 + primitives.SETTLE_TIME) / CTRL_DT)
+    assert changed.num_ctrl - kept.num_ctrl == round(primitives.APERTURE_TIME / CTRL_DT)
+    fingers = np.asarray(changed.ctrl[:, 6])
+    assert fingers[0] == pytest.approx(home.FINGER_OPEN)
+    assert fingers[int(primitives.APERTURE_TIME / CTRL_DT) + 1] == pytest.approx(home.FINGER_CLOSED, abs=1e-6)
+    still = np.asarray(changed.ctrl[: int(primitives.APERTURE_TIME / CTRL_DT), :6])
+    np.testing.assert_allclose(still, np.broadcast_to(still[0], still.shape), atol=1e-5)
+
+
+def test_plan_ends_at_p2():
+    path = plan((-0.3, 0.0), (-0.2, 0.11))
+    assert path.reachable
+    hand = jax.vmap(kinematics.grasp_pose)(path.ctrl[int(path.num_ctrl) - 5 : int(path.num_ctrl), :6])
+    np.testing.assert_allclose(hand[:, :3], np.tile([-0.2, 0.11, 0.1], (5, 1)), atol=1e-4)
+
+
+@pytest.mark.parametrize("end", [(-0.1, 0.0), (-0.3, 0.25)])
+def test_too_long_or_short_plans(end):
+    longer = np.hypot(end[0] + 0.3, end[1]) > 0.15 + 0.06
+    assert bool(plan((-0.3, 0.0), end).reachable) is not longer
+
+
+def test_out_of_reach_is_unreachable():
+    joints = jnp.asarray(home.home_joints())
+    far = jnp.array([[-0.3 + 0.004 * i, 0.0, 0.1] for i in range(200)])
+    commands, ok = primitives.plan_arm(joints, far)
+    assert ok[5] and not ok[-1]
+    assert np.isfinite(commands).all(), "a missing solution must not leak NaN into the controls"
+
+
+def test_plan_traces_once():
+    count = 0
+
+    def traced(end):
+        nonlocal count
+        count += 1
+        return plan((-0.3, 0.0), end).num_ctrl
+
+    jitted = jax.jit(traced)
+    jitted(jnp.array([-0.2, 0.0]))
+    jitted(jnp.array([-0.2, 0.1]))
+    assert count == 1

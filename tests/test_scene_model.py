@@ -1,0 +1,117 @@
+import mujoco
+import numpy as np
+import pytest
+
+from pregrasp_jax.assets.catalogue import builtin_bank
+from pregrasp_jax.physics.native import Simulations
+from pregrasp_jax.robot import description, home
+from pregrasp_jax.scene.model import hull_points, make_slot_model, parking_poses
+from pregrasp_jax.types import HullBank
+
+NUM_STEPS = 300
+
+
+@pytest.fixture(scope="module")
+def bank() -> HullBank:
+    return builtin_bank("seen")
+
+
+@pytest.fixture(scope="module")
+def slots(bank):
+    return make_slot_model(description.load_spec(), bank)
+
+
+def compile_separately(bank: HullBank, object_ids: np.ndarray, meaninertia: float) -> mujoco.MjModel:
+    """Build the same scene the ordinary way: one body per object, its hulls as meshes, nothing rewritten."""
+    spec = description.load_spec()
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    for slot, obj in enumerate(object_ids):
+        body = spec.worldbody.add_body(name=f"object_{slot}")
+        body.add_freejoint()
+        if obj < 0:
+            body.gravcomp = 1
+        i = max(int(obj), 0)
+        body.explicitinertial = True
+        body.mass = float(bank.mass[i]) if obj >= 0 else 0.1
+        body.inertia = np.asarray(bank.inertia[i], np.float64) if obj >= 0 else np.full(3, 1e-4)
+        body.ipos = np.asarray(bank.com[i], np.float64) if obj >= 0 else np.zeros(3)
+        body.iquat = np.asarray(bank.inertia_quat[i], np.float64) if obj >= 0 else np.array([1.0, 0, 0, 0])
+        for hull in np.asarray(bank.object_hulls[i]) if obj >= 0 else []:
+            if hull < 0:
+                continue
+            name = f"slot_{slot}_hull_{hull}"
+            mesh = spec.add_mesh(name=name)
+            mesh.uservert = hull_points(bank, hull).ravel()
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+            friction = [float(bank.friction[i]), 0.005, 0.0001]
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, friction=friction)
+    mj_model = spec.compile()
+    mj_model.stat.meaninertia = meaninertia  # the slot model's; it scales the solver's tolerance
+    return mj_model
+
+
+def scene(bank: HullBank, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Draw objects that stand on a 3 x 3 lattice around the hand, some of them touching it and each other."""
+    rng = np.random.default_rng(seed)
+    object_ids = rng.choice(len(bank.names), 8, replace=False)
+    object_ids[8 - seed :] = -1
+    poses = parking_poses()
+    for slot in range(8):
+        if object_ids[slot] >= 0:
+            yaw = rng.uniform(0, np.pi)
+            xy = 0.07 * np.array([slot % 3 - 1, slot // 3 - 1]) - [0.12, 0]
+            poses[slot] = [*xy, 0.001, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+    return object_ids, poses
+
+
+def separate_rollout(bank, object_ids, poses, ctrl, meaninertia) -> np.ndarray:
+    mj_model = compile_separately(bank, object_ids, meaninertia)
+    data = mujoco.MjData(mj_model)
+    home.set_home(mj_model, data)
+    data.qpos[-56:] = poses.ravel()
+    for row in ctrl:
+        data.ctrl[:] = row
+        mujoco.mj_step(mj_model, data)
+    return data.qpos.copy()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_slots_equal_separately_compiled_models(bank, slots, seed):
+    object_ids, poses = scene(bank, seed)
+    simulations = Simulations(slots, threads=2)
+    other_ids, other_poses = scene(bank, 2)
+    num_rows = NUM_STEPS // simulations.num_substeps
+    state = simulations.initial_state(np.stack([other_poses, poses]))
+    hold = home.home_ctrl()
+    ctrl = np.repeat(np.stack([hold, hold])[:, None], num_rows, axis=1)
+    rows = np.full(2, num_rows)
+    simulations.run(state, np.stack([object_ids, other_ids]), ctrl, rows)
+    new_state, diverged = simulations.run(state, np.stack([other_ids, object_ids]), ctrl, rows)
+    scale = slots.mj_model.stat.meaninertia
+    expected = separate_rollout(bank, object_ids, poses, np.tile(hold, (NUM_STEPS, 1)), scale)
+    object_poses, _ = simulations.describe(new_state)
+    assert not diverged.any()
+    np.testing.assert_array_equal(object_poses[1].ravel(), expected[-56:].astype(np.float32))
+    moved = np.linalg.norm(object_poses[1, :, :2] - poses[:, :2], axis=1)
+    assert moved.max() > 1e-3, "the scene must really collide"
+
+
+def test_results_do_not_depend_on_threads(bank, slots):
+    object_ids, poses = (np.stack(x) for x in zip(scene(bank, 0), scene(bank, 3), scene(bank, 1), strict=True))
+    results = []
+    for threads in (1, 2):
+        simulations = Simulations(slots, threads=threads)
+        state = simulations.initial_state(poses)
+        ctrl = np.tile(home.home_ctrl(), (3, 40, 1))
+        results.append(simulations.run(state, object_ids, ctrl, np.array([40, 7, 23]))[0])
+    np.testing.assert_array_equal(results[0], results[1])
+
+
+def test_parked_slots_stay_where_they_are(bank, slots):
+    simulations = Simulations(slots)
+    poses = parking_poses()[None]
+    state = simulations.initial_state(poses)
+    ctrl = np.tile(home.home_ctrl(), (1, 100, 1))
+    state, _ = simulations.run(state, np.full((1, 8), -1), ctrl, np.array([100]))
+    np.testing.assert_allclose(simulations.describe(state)[0], poses, atol=1e-6)
