@@ -44,7 +44,7 @@ def quat_to_matrix(quat: jax.Array) -> jax.Array:
 
 def transform_points(pose: jax.Array, points: jax.Array) -> jax.Array:
     """Move points [..., 3] from the pose's frame to the frame the pose is given in."""
-    return points @ quat_to_matrix(pose[3:]).T + pose[:3]
+    return points @ quat_to_matrix(pose[3:]).T + jnp.broadcast_to(pose[:3], points.shape)
 
 
 def transform_planes(pose: jax.Array, planes: jax.Array) -> jax.Array:
@@ -66,7 +66,7 @@ def vertical_interval(planes: jax.Array, x: jax.Array, y: jax.Array) -> tuple[ja
         z_top = -inf.
     """
     x, y = x[..., None], y[..., None]
-    nx, ny, nz, d = planes.T
+    nx, ny, nz, d = jnp.expand_dims(planes.T, tuple(range(1, x.ndim)))
     rest = d - nx * x - ny * y
     up, down = nz > _VERTICAL, nz < -_VERTICAL
     z = rest / jnp.where(up | down, nz, 1.0)
