@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from fake_env import fake_env, make_scenes
 
-from pregrasp_jax import grid, policies, results
+from pregrasp_jax import grid, policies
 from pregrasp_jax.config import Config, TaskConfig
-from pregrasp_jax.evaluation import Evaluator, evaluate_policy
-from pregrasp_jax.results import Episode, EvaluationResult
+from pregrasp_jax.evaluation import Episode, EvaluationResult, Evaluator, evaluate_policy, results
 from pregrasp_jax.types import OPEN, REASONS, EnvState
 
 ENV = fake_env()

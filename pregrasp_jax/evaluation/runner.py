@@ -14,10 +14,10 @@ import numpy as np
 from jax.tree_util import Partial
 
 from pregrasp_jax.env import Env
+from pregrasp_jax.evaluation.results import GRASP_FAILED, Episode, EvaluationResult
 from pregrasp_jax.judge import RUNNING, TARGET_IN_REGION
 from pregrasp_jax.policies import Policy
 from pregrasp_jax.primitives import APERTURE_TIME, SETTLE_TIME
-from pregrasp_jax.results import GRASP_FAILED, Episode, EvaluationResult
 from pregrasp_jax.types import REASONS, EnvState
 
 Progress = Callable[[int, int, int], None]
