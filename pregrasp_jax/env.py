@@ -18,7 +18,7 @@ from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.judge import judge
 from pregrasp_jax.physics import make_engine
 from pregrasp_jax.physics.base import CTRL_DT, Engine
-from pregrasp_jax.robot import home
+from pregrasp_jax.robot import model as robot
 from pregrasp_jax.robot.closing_region import scene_coverage
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.bank import SceneBank, Split
@@ -127,10 +127,10 @@ class Env:
         """Close with constant force, lift 0.2 m, hold 5 s; return whether the target stayed between the fingers."""
         times = CTRL_DT * jnp.arange(round((CLOSE_TIME + LIFT_HEIGHT / LIFT_SPEED + HOLD_TIME) / CTRL_DT))
         lift = LIFT_HEIGHT * primitives.minimum_jerk((times - CLOSE_TIME) / (LIFT_HEIGHT / LIFT_SPEED))
-        base = jnp.array([*[0.0] * 2, home.PUSH_HEIGHT]).at[:2].set(state.p1)
+        base = jnp.array([*[0.0] * 2, robot.PUSH_HEIGHT]).at[:2].set(state.p1)
         positions = base[None] + lift[:, None] * jnp.array([[0.0, 0.0, 1.0]])
         arm, ok = primitives.plan_arm(state.physics_obs.joint_pos[:6], positions)
-        fingers = jnp.full((len(times), 1), home.FINGER_CLOSED)
+        fingers = jnp.full((len(times), 1), robot.FINGER_CLOSED)
         ctrl = jnp.concatenate([arm, fingers], axis=1)
         physics = self.engine.run(state.physics, ctrl, jnp.where(jnp.all(ok), len(times), 0))
         after = self.engine.observe(physics)
@@ -155,7 +155,7 @@ class Env:
                 physics_obs=self.engine.observe(physics),
                 obs=Observation(blank, blank),
                 centroids=jnp.zeros((MAX_OBJECTS, 2)),
-                p1=jnp.asarray(home.START[:2], jnp.float32),
+                p1=jnp.asarray(robot.START_POSE[:2], jnp.float32),
                 aperture=jnp.int32(OPEN),
                 num_pushes=jnp.int32(0),
             )

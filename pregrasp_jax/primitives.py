@@ -12,7 +12,8 @@ import jax.numpy as jnp
 
 from pregrasp_jax import grid
 from pregrasp_jax.physics.base import CTRL_DT
-from pregrasp_jax.robot import clearance, home, kinematics
+from pregrasp_jax.robot import clearance, description, kinematics
+from pregrasp_jax.robot import model as robot
 from pregrasp_jax.types import OPEN
 
 SETTLE_TIME = 0.25
@@ -103,7 +104,7 @@ def plan_push(
     time = CTRL_DT * jnp.arange(num_rows)
     share = minimum_jerk((time - wait) / duration)
     xy = p1[None] + share[:, None] * (p2 - p1)[None]
-    positions = jnp.concatenate([xy, jnp.full((num_rows, 1), home.PUSH_HEIGHT)], axis=1)
+    positions = jnp.concatenate([xy, jnp.full((num_rows, 1), robot.PUSH_HEIGHT)], axis=1)
     opening = minimum_jerk(time / APERTURE_TIME)
     before, after = finger_command(aperture_before), finger_command(aperture)
     fingers = before + opening * (after - before)
@@ -139,10 +140,10 @@ def plan_arm(joints: jax.Array, positions: jax.Array) -> tuple[jax.Array, jax.Ar
     low, high = kinematics.joint_limits().T
     within = (path >= low[None]) & (path <= high[None]) & (jnp.abs(velocity) <= MAX_JOINT_SPEED)
     clear = jax.vmap(clearance.link_clearance)(path) >= clearance.CLEARANCE_MARGIN
-    lead = jnp.asarray(home.feed_forward(), jnp.float32)[None]
+    lead = jnp.asarray(robot.feed_forward(description.robot_model())[:6], jnp.float32)[None]
     return path + lead * velocity, solved & jnp.all(within, axis=-1) & clear
 
 
 def finger_command(aperture: jax.Array) -> jax.Array:
     """Return the finger drive angle, rad, of an aperture."""
-    return jnp.where(aperture == OPEN, home.FINGER_OPEN, home.FINGER_CLOSED)
+    return jnp.where(aperture == OPEN, robot.FINGER_OPEN, robot.FINGER_CLOSED)

@@ -1,3 +1,4 @@
+import functools
 import math
 
 import jax
@@ -7,24 +8,18 @@ import pytest
 
 from pregrasp_jax import grid, primitives
 from pregrasp_jax.physics.base import CTRL_DT
-from pregrasp_jax.robot import home, kinematics
+from pregrasp_jax.robot import kinematics
+from pregrasp_jax.robot import model as robot
 from pregrasp_jax.types import CLOSED, OPEN
 
 SPEED = 0.1
 NUM_ROWS = primitives.num_push_rows(0.15, SPEED)
+PLAN = jax.jit(functools.partial(primitives.plan_push, push_speed=SPEED, num_rows=NUM_ROWS))
 
 
 def plan(start, end, before=OPEN, after=OPEN):
-    joints = jnp.asarray(home.home_joints())
-    return primitives.plan_push(
-        joints,
-        jnp.asarray(start, jnp.float32),
-        jnp.asarray(end, jnp.float32),
-        jnp.int32(before),
-        jnp.int32(after),
-        push_speed=SPEED,
-        num_rows=NUM_ROWS,
-    )
+    joints = jnp.asarray(robot.home_joint_pos()[:6])
+    return PLAN(joints, jnp.asarray(start, jnp.float32), jnp.asarray(end, jnp.float32), before, after)
 
 
 def loop_mask(p1, r_in, r_out, full):
@@ -71,8 +66,8 @@ def test_push_times_and_fingers():
     assert kept.num_ctrl == math.ceil((1.0 + primitives.SETTLE_TIME) / CTRL_DT)
     assert changed.num_ctrl - kept.num_ctrl == round(primitives.APERTURE_TIME / CTRL_DT)
     fingers = np.asarray(changed.ctrl[:, 6])
-    assert fingers[0] == pytest.approx(home.FINGER_OPEN)
-    assert fingers[int(primitives.APERTURE_TIME / CTRL_DT) + 1] == pytest.approx(home.FINGER_CLOSED, abs=1e-6)
+    assert fingers[0] == pytest.approx(robot.FINGER_OPEN)
+    assert fingers[int(primitives.APERTURE_TIME / CTRL_DT) + 1] == pytest.approx(robot.FINGER_CLOSED, abs=1e-6)
     still = np.asarray(changed.ctrl[: int(primitives.APERTURE_TIME / CTRL_DT), :6])
     np.testing.assert_allclose(still, np.broadcast_to(still[0], still.shape), atol=1e-5)
 
@@ -91,9 +86,9 @@ def test_too_long_or_short_plans(end):
 
 
 def test_out_of_reach_is_unreachable():
-    joints = jnp.asarray(home.home_joints())
+    joints = jnp.asarray(robot.home_joint_pos()[:6])
     far = jnp.array([[-0.3 + 0.004 * i, 0.0, 0.1] for i in range(200)])
-    commands, ok = primitives.plan_arm(joints, far)
+    commands, ok = jax.jit(primitives.plan_arm)(joints, far)
     assert ok[5] and not ok[-1]
     assert np.isfinite(commands).all(), "a missing solution must not leak NaN into the controls"
 

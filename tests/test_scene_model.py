@@ -4,7 +4,7 @@ import pytest
 
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.physics.native import Simulations
-from pregrasp_jax.robot import description, home
+from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene.model import hull_points, make_slot_model, parking_poses
 from pregrasp_jax.types import HullBank
 
@@ -18,12 +18,12 @@ def bank() -> HullBank:
 
 @pytest.fixture(scope="module")
 def slots(bank):
-    return make_slot_model(description.load_spec(), bank)
+    return make_slot_model(robot.load_spec(), bank)
 
 
 def compile_separately(bank: HullBank, object_ids: np.ndarray, meaninertia: float) -> mujoco.MjModel:
     """Build the same scene the ordinary way: one body per object, its hulls as meshes, nothing rewritten."""
-    spec = description.load_spec()
+    spec = robot.load_spec()
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     for slot, obj in enumerate(object_ids):
@@ -68,7 +68,7 @@ def scene(bank: HullBank, seed: int) -> tuple[np.ndarray, np.ndarray]:
 def separate_rollout(bank, object_ids, poses, ctrl, meaninertia) -> np.ndarray:
     mj_model = compile_separately(bank, object_ids, meaninertia)
     data = mujoco.MjData(mj_model)
-    home.set_home(mj_model, data)
+    robot.set_home(mj_model, data)
     data.qpos[-56:] = poses.ravel()
     for row in ctrl:
         data.ctrl[:] = row
@@ -83,7 +83,7 @@ def test_slots_equal_separately_compiled_models(bank, slots, seed):
     other_ids, other_poses = scene(bank, 2)
     num_rows = NUM_STEPS // simulations.num_substeps
     state = simulations.initial_state(np.stack([other_poses, poses]))
-    hold = home.home_ctrl()
+    hold = robot.home_joint_pos()[:7]
     ctrl = np.repeat(np.stack([hold, hold])[:, None], num_rows, axis=1)
     rows = np.full(2, num_rows)
     simulations.run(state, np.stack([object_ids, other_ids]), ctrl, rows)
@@ -103,7 +103,7 @@ def test_results_do_not_depend_on_threads(bank, slots):
     for threads in (1, 2):
         simulations = Simulations(slots, threads=threads)
         state = simulations.initial_state(poses)
-        ctrl = np.tile(home.home_ctrl(), (3, 40, 1))
+        ctrl = np.tile(robot.home_joint_pos()[:7], (3, 40, 1))
         results.append(simulations.run(state, object_ids, ctrl, np.array([40, 7, 23]))[0])
     np.testing.assert_array_equal(results[0], results[1])
 
@@ -112,6 +112,6 @@ def test_parked_slots_stay_where_they_are(bank, slots):
     simulations = Simulations(slots)
     poses = parking_poses()[None]
     state = simulations.initial_state(poses)
-    ctrl = np.tile(home.home_ctrl(), (1, 100, 1))
+    ctrl = np.tile(robot.home_joint_pos()[:7], (1, 100, 1))
     state, _ = simulations.run(state, np.full((1, 8), -1), ctrl, np.array([100]))
     np.testing.assert_allclose(simulations.describe(state)[0], poses, atol=1e-6)

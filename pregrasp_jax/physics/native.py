@@ -17,7 +17,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from pregrasp_jax.physics.base import CTRL_DT, MAX_SPEED, NUM_CONTROLS, Engine
-from pregrasp_jax.robot import description, home
+from pregrasp_jax.robot import model as robot
 from pregrasp_jax.robot.kinematics import grasp_pose
 from pregrasp_jax.scene import model as slot_model
 from pregrasp_jax.scene.model import SlotModel
@@ -55,7 +55,7 @@ class Simulations:
         self.num_substeps = round(CTRL_DT / model.mj_model.opt.timestep)
         self._threads = threads
         self._lock = threading.Lock()
-        self._joint_ids = home.joint_qpos_ids(model.mj_model)
+        self._joint_ids = robot.joint_qpos_ids(model.mj_model)
         self._allocate(1)
 
     def _allocate(self, num_scenes: int) -> None:
@@ -124,7 +124,7 @@ class Simulations:
     def initial_state(self, object_poses: np.ndarray) -> np.ndarray:
         """Return states [E, nstate] with objects at rest at poses [E, MAX_OBJECTS, 7] and the robot at the start."""
         mj_model, data = self.model.mj_model, mujoco.MjData(self.model.mj_model)
-        home.set_home(mj_model, data)
+        robot.set_home(mj_model, data)
         template = np.zeros(self.state_size)
         mujoco.mj_getState(mj_model, data, template, _STATE)
         state = np.repeat(template[None], len(object_poses), axis=0)
@@ -157,7 +157,7 @@ def make_engine(bank: HullBank, *, threads: int = 0) -> Engine:
         bank: host hull bank.
         threads: 0 takes every core; results do not depend on it.
     """
-    simulations = Simulations(slot_model.make_slot_model(description.load_spec(), bank), threads=threads)
+    simulations = Simulations(slot_model.make_slot_model(robot.load_spec(), bank), threads=threads)
     shapes = NativeState(
         bits=jax.ShapeDtypeStruct((2 * simulations.state_size,), jnp.uint32),
         object_ids=jax.ShapeDtypeStruct((MAX_OBJECTS,), jnp.int32),
@@ -169,7 +169,7 @@ def make_engine(bank: HullBank, *, threads: int = 0) -> Engine:
     def package(state: np.ndarray, object_ids: np.ndarray, diverged: np.ndarray, batch: tuple[int, ...]) -> NativeState:
         object_poses, joint_pos = simulations.describe(state)
         flat = NativeState(_to_bits(state), object_ids.astype(np.int32), object_poses, joint_pos, diverged)
-        return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), flat)
+        return jax.tree.map(lambda x: x.reshape((*batch, *x.shape[1:])), flat)
 
     def host_reset(object_ids: Any, poses: Any) -> NativeState:
         object_ids, poses = np.asarray(object_ids), np.asarray(poses)

@@ -58,7 +58,6 @@ def make_slot_model(spec: mujoco.MjSpec, bank: HullBank) -> SlotModel:
     Raises:
         ValueError: an object of the bank has no hull.
     """
-    num_hulls = bank.full.vertices.shape[0]
     if not (np.asarray(bank.object_hulls)[:, 0] >= 0).all():
         raise ValueError("hull bank: every object needs at least one hull")
     _add_hull_meshes(spec, bank)

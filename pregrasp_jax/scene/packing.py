@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from pregrasp_jax.robot import description
+from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene import model as slot_model
 from pregrasp_jax.scene.model import SlotModel
 from pregrasp_jax.types import HullBank
@@ -44,7 +44,7 @@ _PLACE_TRIES = 200
 
 def table_spec() -> mujoco.MjSpec:
     """Return a table without a robot, with the contact options of the full scene."""
-    return description.load_table_spec()
+    return robot.load_table_spec()
 
 
 def footprint_radius(bank: HullBank) -> np.ndarray:

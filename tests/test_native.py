@@ -1,0 +1,128 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pregrasp_jax import primitives
+from pregrasp_jax.assets.catalogue import builtin_bank
+from pregrasp_jax.config import SceneConfig
+from pregrasp_jax.physics import make_engine
+from pregrasp_jax.physics.base import CTRL_DT, Engine
+from pregrasp_jax.robot import model as robot
+from pregrasp_jax.scene import bank as scene_bank
+from pregrasp_jax.scene.model import parking_poses
+from pregrasp_jax.types import OPEN, SceneParams
+
+ENDS = ((-0.2, 0.0), (-0.25, 0.1), (-0.15, 0.0))
+NUM_ROWS = primitives.num_push_rows(0.15, 0.1)
+
+
+@pytest.fixture(scope="module")
+def engine() -> Engine:
+    return make_engine("native", builtin_bank("seen"))
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    config = SceneConfig(test_scenes=3)
+    return scene_bank.load_or_build(builtin_bank("seen"), config, "test")
+
+
+def empty_scene() -> SceneParams:
+    return SceneParams(jnp.full(8, -1), jnp.asarray(parking_poses(), jnp.float32), jnp.int32(0))
+
+
+def packed_scene(scenes, index) -> SceneParams:
+    return SceneParams(
+        jnp.asarray(scenes.object_ids[index]), jnp.asarray(scenes.poses[index]), jnp.asarray(scenes.target[index])
+    )
+
+
+@jax.jit
+def plan(joints, start, end):
+    return primitives.plan_push(
+        joints,
+        jnp.asarray(start),
+        jnp.asarray(end),
+        jnp.int32(OPEN),
+        jnp.int32(OPEN),
+        push_speed=0.1,
+        num_rows=NUM_ROWS,
+    )
+
+
+def push(engine, state, start, end, num_ctrl=None):
+    planned = plan(engine.observe(state).joint_pos[:6], start, end)
+    return engine.run(state, planned.ctrl, planned.num_ctrl if num_ctrl is None else num_ctrl)
+
+
+def test_reset_puts_everything_where_the_scene_says(engine, scenes):
+    scene = packed_scene(scenes, 0)
+    seen = engine.observe(engine.reset(engine.init(), scene))
+    np.testing.assert_array_equal(seen.object_poses, scene.poses)
+    np.testing.assert_allclose(seen.hand_pose, [*robot.START_POSE], atol=1e-5)
+    np.testing.assert_allclose(seen.joint_pos[6:], robot.FINGER_OPEN, atol=1e-6)
+    assert not seen.diverged
+
+
+@pytest.mark.parametrize("end", [(-0.15, 0.0), (-0.3, 0.15), (-0.25, -0.1)])
+def test_a_free_push_ends_where_it_should(engine, end):
+    state = engine.reset(engine.init(), empty_scene())
+    state = jax.jit(lambda s: push(engine, s, robot.START_POSE[:2], end))(state)
+    hand = engine.observe(state).hand_pose
+    np.testing.assert_allclose(hand[:3], [*end, robot.PUSH_HEIGHT], atol=5e-4)
+
+
+def test_a_free_push_stays_on_its_line(engine):
+    start, end = np.array(robot.START_POSE[:2]), np.array([-0.2, 0.1])
+    direction = (end - start) / np.linalg.norm(end - start)
+    for num_ctrl in (20, 35, 50):
+        state = engine.reset(engine.init(), empty_scene())
+        hand = engine.observe(push(engine, state, start, end, jnp.int32(num_ctrl))).hand_pose[:2] - start
+        assert abs(float(np.cross(np.append(direction, 0), np.append(hand, 0))[2])) < 2e-3
+        planned = 0.1414 * float(primitives.minimum_jerk(jnp.float32(num_ctrl * CTRL_DT / 1.414)))
+        assert abs(float(np.dot(direction, hand)) - planned) < 4e-3
+
+
+def test_a_push_moves_objects_and_batching_changes_nothing(engine, scenes):
+    nearer = jnp.array([-0.08, 0, 0, 0, 0, 0, 0])
+    packed = [packed_scene(scenes, i) for i in range(3)]
+    packed = [scene.replace(poses=scene.poses + nearer[None]) for scene in packed]
+    plans = [plan(jnp.asarray(robot.home_joint_pos()[:6]), robot.START_POSE[:2], end) for end in ENDS]
+
+    def run(scene, plan):
+        return engine.run(engine.reset(engine.init(), scene), plan.ctrl, plan.num_ctrl)
+
+    alone = [jax.jit(run)(*arguments) for arguments in zip(packed, plans, strict=True)]
+    together = jax.jit(jax.vmap(run))(*(jax.tree.map(lambda *x: jnp.stack(x), *each) for each in (packed, plans)))
+    for i in range(3):
+        np.testing.assert_array_equal(together.bits[i], alone[i].bits)
+    moved = np.abs(np.asarray(together.object_poses) - np.stack([p.poses for p in packed]))[..., :2].max(axis=(1, 2))
+    assert moved.max() > 0.01
+
+
+def test_zero_rows_change_nothing(engine, scenes):
+    state = engine.reset(engine.init(), packed_scene(scenes, 0))
+    after = push(engine, state, robot.START_POSE[:2], (-0.2, 0.0), jnp.int32(0))
+    np.testing.assert_array_equal(state.bits, after.bits)
+
+
+def test_a_diverged_scene_is_reported_alone_and_stays_diverged(engine, scenes):
+    scene = packed_scene(scenes, 0)
+    bad = dataclasses.replace(scene, poses=scene.poses.at[0, 2].set(jnp.nan))
+    both = jax.tree.map(lambda *x: jnp.stack(x), bad, scene)
+
+    def run(scene):
+        return push(engine, engine.reset(engine.init(), scene), robot.START_POSE[:2], (-0.25, 0.0))
+
+    state = jax.jit(jax.vmap(run))(both)
+    np.testing.assert_array_equal(state.diverged, [True, False])
+    again = jax.vmap(lambda s: push(engine, s, robot.START_POSE[:2], (-0.25, 0.0)))(state)
+    np.testing.assert_array_equal(again.diverged, [True, False])
+
+
+def test_an_unknown_engine_is_refused():
+    with pytest.raises(ValueError, match=r"physics.engine = 'bullet' .* allowed: native"):
+        make_engine("bullet", builtin_bank("seen"))
