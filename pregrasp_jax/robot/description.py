@@ -19,7 +19,7 @@ ACTUATORS = (*ARM_JOINTS, "hand_fingers")
 """The seven controls, rad: six arm joints and the drive of both fingers."""
 
 BASE_BODY = "base"
-HAND_BODY = "hand_palm"
+HAND_BODY = PALM_GEOM = "hand_palm"
 
 
 def mjcf_dir() -> Path:
@@ -90,3 +90,8 @@ def flange_from_grasp_point() -> np.ndarray:
     site, flange = robot_model().site("grasp_point"), robot_model().site("flange")
     wrist_from_flange = pose_to_matrix(flange.pos, flange.quat)
     return np.linalg.inv(wrist_from_flange) @ pose_to_matrix(site.pos, site.quat)
+
+
+def grasp_offset() -> float:
+    """Return the distance from the flange to the grasp point along the hand, m."""
+    return float(flange_from_grasp_point()[2, 3])

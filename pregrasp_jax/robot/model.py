@@ -24,7 +24,7 @@ PUSH_HEIGHT = 0.1
 START_POSE = (-0.30, 0.0, PUSH_HEIGHT, 1.0, 0.0, 0.0, 0.0)
 """Grasp point pose [7] at the start of an episode: the near side of the table, pointing +x, level."""
 
-GRASP_OFFSET = 0.172
+GRASP_OFFSET = description.grasp_offset()
 """m from the flange to the grasp point along the hand: half way from the palm to the open fingertips."""
 
 
