@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax import geometry, grid, heightmap, primitives
-from pregrasp_jax.assets import load_bank_for
+from pregrasp_jax.assets.sets import load_bank_for
 from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.judge import judge
 from pregrasp_jax.physics import make_engine
@@ -207,7 +207,7 @@ def make_env(
         ValueError: the objects or settings cannot be used; one line says why.
     """
     threads = config.physics.threads if threads is None else threads
-    bank, _ = load_bank_for(config.assets.object_dir, config.assets.object_set)
+    bank = load_bank_for(config.assets.object_dir, config.assets.object_set)
     scenes = scene_bank.load_or_build(bank, config.scene, split, threads=threads, progress=progress)
     engine = make_engine(config.physics.engine, bank, threads=threads)
     guided = config.exploration.guided

@@ -1,0 +1,225 @@
+"""Full environment steps per second, split by stage; prints one JSON object.
+
+    python benchmarks/env.py --scenes 16 [--compare pybullet]
+
+A step is a push of mean length 0.1 m by every scene: planning, physics, heightmap, judging, and a reset of the
+scenes that ended. `--compare pybullet` runs the same hulls and push lengths in two PyBullet processes, each
+step with one 640 x 480 TinyRenderer depth and segmentation image (PyBullet must be installed by hand).
+"""
+
+import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
+
+# isort: split
+import argparse
+import dataclasses
+import functools
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pregrasp_jax import grid, heightmap, primitives
+from pregrasp_jax.config import PRESETS
+from pregrasp_jax.env import Env, make_env
+from pregrasp_jax.types import CLOSED, MAX_HULLS, OPEN, EnvState
+
+LENGTHS = (0.05, 0.15)
+"""m; push lengths are uniform in this range, 0.1 m on average."""
+
+SETTLE_TIME = primitives.SETTLE_TIME
+
+
+def sample_action(state: EnvState, key: jax.Array) -> jax.Array:
+    """Return a push of random length toward the target, within 0.5 rad, open with probability 0.7."""
+    length_key, angle_key, open_key = jax.random.split(key, 3)
+    offset = state.centroids[state.scene.target] - state.p1
+    angle = jnp.atan2(offset[1], offset[0]) + 0.5 * jax.random.normal(angle_key)
+    length = jax.random.uniform(length_key, minval=LENGTHS[0], maxval=LENGTHS[1])
+    p2 = state.p1 + length * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    row, col = grid.world_to_cell(jnp.clip(p2, -0.249, 0.249))
+    return grid.encode_action(row, col, jnp.where(jax.random.bernoulli(open_key, 0.7), OPEN, CLOSED))
+
+
+def full_step(env: Env, state: EnvState, key: jax.Array) -> tuple[EnvState, jax.Array]:
+    """Push, then reset the scenes that ended; what training does between two updates."""
+    action_key, reset_key = jax.random.split(key)
+    num_scenes = state.num_pushes.shape[0]
+    actions = jax.vmap(sample_action)(state, jax.random.split(action_key, num_scenes))
+    next_state, result = jax.vmap(env.step)(state, actions)
+    fresh = jax.vmap(env.reset)(jax.random.split(reset_key, num_scenes))
+    ended = result.terminated | result.truncated
+
+    def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(ended.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    return jax.tree.map(choose, fresh, next_state), jnp.linalg.norm(next_state.p1 - state.p1, axis=-1)
+
+
+def seconds(function: Callable[..., Any], *arguments: Any, repeats: int) -> float:
+    """Return the median seconds of a jitted function after one warm-up."""
+    jax.block_until_ready(function(*arguments))
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(function(*arguments))
+        times.append(time.perf_counter() - start)
+    return float(np.median(times))
+
+
+def measure(num_scenes: int, num_steps: int) -> dict[str, Any]:
+    """Run `num_steps` full steps of `num_scenes` scenes, and each stage alone on states met on the way."""
+    config = PRESETS["cpu"]
+    config = dataclasses.replace(config, scene=dataclasses.replace(config.scene, validation_scenes=50))
+    env = make_env(config, split="validation")
+    step = jax.jit(functools.partial(full_step, env))
+    key = jax.random.key(0)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, num_scenes))
+    state, _ = jax.block_until_ready(step(state, key))
+    times, lengths, parts = [], [], {"plan": 0.0, "physics": 0.0, "heightmap": 0.0}
+    for i in range(num_steps):
+        step_key = jax.random.fold_in(key, i)
+        if i % max(num_steps // 4, 1) == 0:
+            for name, value in measure_stages(env, state, step_key).items():
+                parts[name] += value / len(range(0, num_steps, max(num_steps // 4, 1)))
+        start = time.perf_counter()
+        state, moved = jax.block_until_ready(step(state, step_key))
+        times.append(time.perf_counter() - start)
+        lengths.extend(np.asarray(moved))
+    total = float(np.sum(times)) / num_steps
+    parts["rest"] = total - sum(parts.values())
+    return {
+        "env_steps_per_second": num_scenes / total,
+        "scenes": num_scenes,
+        "steps": num_steps,
+        "mean_push_m": float(np.mean([x for x in lengths if x > 0])),
+        "unreachable_share": float(np.mean([x == 0 for x in lengths])),
+        "ms_per_env_step": {name: 1e3 * value / num_scenes for name, value in parts.items()},
+        "cores": len(os.sched_getaffinity(0)),
+    }
+
+
+def measure_stages(env: Env, state: EnvState, key: jax.Array) -> dict[str, float]:
+    """Return seconds per parallel step of planning, physics and heightmap, each compiled alone."""
+    num_scenes = state.num_pushes.shape[0]
+    actions = jax.vmap(sample_action)(state, jax.random.split(jax.random.split(key)[0], num_scenes))
+
+    def plan(state: EnvState, action: jax.Array) -> primitives.Plan:
+        row, col, aperture = grid.decode_action(action)
+        return primitives.plan_push(
+            state.physics_obs.joint_pos[:6],
+            state.p1,
+            grid.cell_to_world(row, col),
+            state.aperture,
+            aperture,
+            push_speed=env.task.push_speed,
+            num_rows=primitives.num_push_rows(env.max_distance, env.task.push_speed),
+        )
+
+    def run(state: EnvState, plan: primitives.Plan) -> Any:
+        return env.engine.run(state.physics, plan.ctrl, jnp.where(plan.reachable, plan.num_ctrl, 0))
+
+    def look(state: EnvState) -> Any:
+        return heightmap.observe(heightmap.scene_hulls(env.bank, state.scene, state.physics_obs))
+
+    plan, run, look = (jax.jit(jax.vmap(f)) for f in (plan, run, look))
+    return {
+        "plan": seconds(plan, state, actions, repeats=3),
+        "physics": seconds(run, state, plan(state, actions), repeats=1),
+        "heightmap": 2 * seconds(look, state, repeats=3),  # a full step looks twice: after the push, after the reset
+    }
+
+
+def pybullet_worker(num_steps: int, seed: int, queue: Any) -> None:
+    """Push through the same packed scenes with a floating hand in PyBullet; put steps and seconds on the queue."""
+    import pybullet as p
+
+    env = make_env(PRESETS["cpu"], split="validation", threads=1)
+    rng = np.random.default_rng(seed)
+    view = p.computeViewMatrix([0, 0, 1.0], [0, 0, 0], [0, 1, 0])
+    projection = p.computeProjectionMatrixFOV(35, 640 / 480, 0.05, 2.0)
+    p.connect(p.DIRECT)
+    elapsed, done = 0.0, 0
+    while done < num_steps:
+        hand = pybullet_scene(p, env, int(rng.integers(len(env.scenes))))
+        position = np.array([-0.30, 0.0, 0.1])
+        start = time.perf_counter()
+        for _ in range(3):
+            angle, length = rng.normal(0, 0.5), rng.uniform(*LENGTHS)
+            position = pybullet_push(p, hand, position, length * np.array([np.cos(angle), np.sin(angle), 0.0]))
+            p.getCameraImage(640, 480, view, projection, renderer=p.ER_TINY_RENDERER)
+            done += 1
+        elapsed += time.perf_counter() - start
+    queue.put((done, elapsed))
+
+
+def pybullet_scene(p: Any, env: Env, index: int) -> int:
+    """Build scene `index` of the bank with the same hulls; return the constraint that carries the hand."""
+    p.resetSimulation()
+    p.setGravity(0, 0, -9.81)
+    p.setTimeStep(1 / 240)
+    plane = p.createMultiBody(0, p.createCollisionShape(p.GEOM_BOX, halfExtents=[2, 2, 0.05]), -1, [0, 0, -0.05])
+    p.changeDynamics(plane, -1, lateralFriction=0.1)
+    vertices, hulls = np.asarray(env.bank.full.vertices), np.asarray(env.bank.object_hulls)
+    for obj, pose in zip(env.scenes.object_ids[index], env.scenes.poses[index], strict=True):
+        if obj < 0:
+            continue
+        ids = [h for h in hulls[obj][:MAX_HULLS] if h >= 0]
+        points = [np.unique(vertices[h], axis=0).tolist() for h in ids]
+        shape = p.createCollisionShapeArray(shapeTypes=[p.GEOM_MESH] * len(ids), vertices=points)
+        com = np.asarray(env.bank.com[obj]).tolist()
+        x, y, z, qw, qx, qy, qz = pose.tolist()
+        body = p.createMultiBody(
+            float(env.bank.mass[obj]), shape, -1, [x, y, z], [qx, qy, qz, qw], baseInertialFramePosition=com
+        )
+        p.changeDynamics(body, -1, lateralFriction=0.5)
+    box = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.05, 0.06, 0.02])
+    hand = p.createMultiBody(1.0, box, -1, [-0.30, 0, 0.1])
+    return p.createConstraint(hand, -1, -1, -1, p.JOINT_FIXED, [0, 0, 0], [0, 0, 0], [-0.30, 0, 0.1])
+
+
+def pybullet_push(p: Any, hand: int, start: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Carry the hand along a minimum-jerk line at 0.1 m/s on average, then wait; return where it is now."""
+    duration = np.linalg.norm(offset) / 0.1
+    for i in range(int((duration + SETTLE_TIME) * 240)):
+        s = min(i / 240 / duration, 1.0)
+        p.changeConstraint(hand, (start + (10 * s**3 - 15 * s**4 + 6 * s**5) * offset).tolist(), maxForce=500)
+        p.stepSimulation()
+    return start + offset
+
+
+def compare_pybullet(num_steps: int) -> float:
+    """Return env steps per second of two PyBullet processes side by side."""
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    workers = [context.Process(target=pybullet_worker, args=(num_steps, seed, queue)) for seed in range(2)]
+    for worker in workers:
+        worker.start()
+    rates = [done / elapsed for done, elapsed in (queue.get(timeout=600) for _ in workers)]
+    for worker in workers:
+        worker.join()
+    return float(sum(rates))
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=int, default=16, help="scenes stepped in parallel")
+    parser.add_argument("--steps", type=int, default=40, help="parallel steps")
+    parser.add_argument("--compare", choices=["pybullet"], help="also run the reference simulator")
+    arguments = parser.parse_args()
+    result = measure(arguments.scenes, arguments.steps)
+    if arguments.compare:
+        reference = compare_pybullet(30)
+        result["pybullet_env_steps_per_second"] = reference
+        result["ratio_to_pybullet"] = result["env_steps_per_second"] / reference
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()
