@@ -223,7 +223,7 @@ def _metrics(
         "train/target_min": jnp.min(targets),
         "train/target_max": jnp.max(targets),
         "train/q_taken": jnp.mean(targets + errors),
-        "train/grad_norm": optax.global_norm(grads),
+        "train/grad_norm": optax.tree.norm(grads),
         "train/share_success": jnp.mean(succeeded.astype(jnp.float32)),
         "train/share_approach": jnp.mean(approached.astype(jnp.float32)),
         "train/share_nothing": jnp.mean((~succeeded & ~approached).astype(jnp.float32)),

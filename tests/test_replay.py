@@ -1,0 +1,332 @@
+"""Every stored byte of these transitions encodes which push it belongs to, so a misaligned field cannot hide."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pregrasp_jax import grid
+from pregrasp_jax.learning import hindsight, replay
+from pregrasp_jax.types import MAX_OBJECTS, Observation, Outcome
+
+NUM_ENVS, MAX_PUSHES = 3, 4
+
+
+def image(ids) -> Observation:
+    """Observations whose two pixels spell a number below 2^16 in each leaf."""
+    ids = np.asarray(ids)
+    pixels = jnp.asarray(np.stack([ids % 256, ids // 256], axis=-1)[..., None, :].astype(np.uint8))
+    return Observation(height=pixels, instance_ids=3 * pixels)
+
+
+def read_image(obs: Observation) -> np.ndarray:
+    height = np.asarray(obs.height, np.int64)
+    np.testing.assert_array_equal(3 * height % 256, obs.instance_ids)
+    return height[..., 0, 0] + 256 * height[..., 0, 1]
+
+
+class World:
+    """Scenes that count: the observation of scene e is a running number, every other field is derived from it."""
+
+    def __init__(self, seed: int, enclose: float = 0.3):
+        self.rng = np.random.default_rng(seed)
+        self.enclose = enclose
+        self.next_id = 1
+        self.current = [self.new_id() for _ in range(NUM_ENVS)]
+        self.pushes = [0] * NUM_ENVS
+        self.history: list[list[dict]] = [[] for _ in range(NUM_ENVS)]
+        self.transitions: list[dict] = []
+
+    def new_id(self) -> int:
+        self.next_id += 1
+        return self.next_id - 1
+
+    def step(self) -> replay.Steps:
+        rows = [self.push(env) for env in range(NUM_ENVS)]
+        self.transitions += rows
+
+        def stack(name, dtype):
+            return jnp.asarray(np.array([row[name] for row in rows], dtype))
+
+        zeros = jnp.zeros(NUM_ENVS, bool)
+        outcome = Outcome(
+            coverage=stack("coverage", np.float32),
+            distance_before=stack("obs", np.float32)[:, None] + jnp.arange(8.0)[None],
+            distance_after=stack("next_obs", np.float32)[:, None] + jnp.arange(8.0)[None],
+            toppled=jnp.zeros((NUM_ENVS, MAX_OBJECTS), bool),
+            off_table=zeros,
+            unreachable=zeros,
+            no_action=zeros,
+            diverged=stack("diverged", bool),
+        )
+        return replay.Steps(
+            obs=image([row["obs"] for row in rows]),
+            action=stack("action", np.int32),
+            goal=stack("goal", np.int32),
+            outcome=outcome,
+            reward=stack("reward", np.float32),
+            terminated=stack("terminated", bool),
+            truncated=stack("truncated", bool),
+            next_obs=image([row["next_obs"] for row in rows]),
+        )
+
+    def push(self, env: int) -> dict:
+        obs, next_obs = self.current[env], self.new_id()
+        coverage = np.zeros(MAX_OBJECTS)
+        goal = obs % 3
+        enclosed = self.rng.random() < self.enclose
+        if enclosed:
+            coverage[3 + obs % 4] = 0.99
+        self.pushes[env] += 1
+        truncated = not enclosed and self.pushes[env] == MAX_PUSHES
+        row = {
+            "obs": obs,
+            "next_obs": next_obs,
+            "goal": goal,
+            "action": obs % grid.NUM_ACTIONS,
+            "reward": float(obs) / 2,
+            "terminated": enclosed,
+            "truncated": truncated,
+            "coverage": coverage,
+            "diverged": False,
+        }
+        ended = enclosed or truncated
+        self.current[env] = self.new_id() if ended else next_obs
+        if ended:
+            self.pushes[env] = 0
+        return row
+
+
+def goal_input(obs: Observation, goal: jax.Array) -> jax.Array:
+    """The fused input of these tiny images: their pixels and the goal."""
+    pixels = obs.height[0].astype(jnp.float32)
+    return jnp.stack([pixels, jnp.full_like(pixels, goal)], axis=-1)[None]
+
+
+def decode_input(inputs: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+    values = np.asarray(inputs, np.int64)
+    return values[:, 0, 0, 0] + 256 * values[:, 0, 1, 0], values[:, 0, 0, 1]
+
+
+add = jax.jit(replay.add, donate_argnums=0)
+add_hindsight = jax.jit(hindsight.add_hindsight, donate_argnums=0)
+sample = jax.jit(
+    functools.partial(replay.sample, batch_size=64, input_fn=goal_input), static_argnames="importance_exponent"
+)
+set_priorities = jax.jit(functools.partial(replay.set_priorities, priority_exponent=0.6))
+ALL_ELIGIBLE = jnp.ones((NUM_ENVS, MAX_OBJECTS), bool)
+
+
+def fill(world: World, memory: replay.Replay, steps: int, relabel: bool = True) -> replay.Replay:
+    for _ in range(steps):
+        memory = add(memory, world.step())
+        if relabel:
+            memory = add_hindsight(memory, ALL_ELIGIBLE)
+    return memory
+
+
+def empty(capacity: int = 37) -> replay.Replay:
+    return replay.init(World(0).step(), capacity=capacity, max_pushes=MAX_PUSHES)
+
+
+def alive_rows(memory: replay.Replay) -> list[tuple]:
+    """(obs id, next obs id, goal, action, reward, terminated, hindsight) of every row that can be sampled."""
+    alive = np.flatnonzero(np.asarray(memory.priorities.leaves) > 0)
+    observations = read_image(memory.observations)
+    rows = jax.tree.map(np.asarray, memory.rows)
+    return [
+        (
+            int(observations[rows.obs_slot[i]]),
+            int(observations[rows.next_obs_slot[i]]),
+            int(rows.goal[i]),
+            int(rows.action[i]),
+            float(rows.reward[i]),
+            bool(rows.terminated[i]),
+            bool(rows.hindsight[i]),
+        )
+        for i in alive
+    ]
+
+
+def test_each_observation_is_stored_once():
+    world = World(0)
+    memory = fill(world, empty(capacity=1000), 40)
+    written = int(memory.observations_written)
+    stored = read_image(memory.observations)[:written]
+    assert sorted(stored) == sorted(set(stored))
+    expected = {row["obs"] for row in world.transitions} | {row["next_obs"] for row in world.transitions}
+    assert set(stored) == expected
+
+
+@pytest.mark.parametrize("capacity", [30, 37, 64, 200])
+def test_alive_rows_are_exactly_those_whose_observations_are_both_kept(capacity):
+    """Against a Python memory that forgets by number, over many wraps of both rings."""
+    world = World(1)
+    memory = empty(capacity)
+    order: list[int] = []
+    fresh = [True] * NUM_ENVS
+    for _ in range(120):
+        steps = world.step()
+        new = world.transitions[-NUM_ENVS:]
+        order += [row["obs"] for row, is_fresh in zip(new, fresh, strict=True) if is_fresh]
+        order += [row["next_obs"] for row in new]
+        fresh = [row["terminated"] or row["truncated"] for row in new]
+        memory = add(memory, steps)
+    kept = set(order[-capacity:])
+    expected = sorted(
+        (row["obs"], row["next_obs"], row["goal"], row["action"], row["reward"], row["terminated"], False)
+        for row in world.transitions
+        if row["obs"] in kept and row["next_obs"] in kept
+    )
+    assert sorted(alive_rows(memory)) == expected
+    assert int(memory.observations_written) == len(order) > 2 * capacity
+    assert set(read_image(memory.observations)) == kept
+
+
+@pytest.mark.parametrize("capacity", [30, 37, 64])
+def test_hindsight_rows_stay_aligned_and_die_with_their_observations(capacity):
+    world = World(2, enclose=0.5)
+    memory = fill(world, empty(capacity), 150)
+    kept = set(read_image(memory.observations))
+    rows = alive_rows(memory)
+    by_obs = {row["obs"]: row for row in world.transitions}
+    assert sum(row[-1] for row in rows) > 5
+    for obs, next_obs, goal, action, reward, terminated, is_hindsight in rows:
+        origin = by_obs[obs]
+        assert next_obs == origin["next_obs"] and action == origin["action"]
+        assert obs in kept and next_obs in kept
+        if is_hindsight:
+            # Distances grow by whole metres here, so the only reward is the end's.
+            assert goal >= 3 and reward == (2.0 if terminated else 0.0)
+            assert terminated == (origin["coverage"][goal] > 0.95)
+        else:
+            assert (goal, reward, terminated) == (origin["goal"], origin["reward"], origin["terminated"])
+    real = {row[0] for row in rows if not row[-1]}
+    assert real == {row["obs"] for row in world.transitions if row["obs"] in kept and row["next_obs"] in kept}
+
+
+def test_the_ring_of_rows_never_overwrites_a_row_that_is_alive():
+    """At the smallest capacity, with most episodes relabelled: rows that die, die with an observation."""
+    world = World(3, enclose=0.6)
+    memory = empty(capacity=30)
+    for _ in range(200):
+        before, first = jax.tree.map(np.array, memory), int(memory.observations_written)
+        memory = add(memory, world.step())
+        overwritten = np.arange(first, int(memory.observations_written)) % 30
+        stale = np.isin(before.rows.obs_slot, overwritten) | np.isin(before.rows.next_obs_slot, overwritten)
+        survivors = (before.priorities.leaves > 0) & ~stale
+        memory = add_hindsight(memory, ALL_ELIGIBLE)
+        for old, new in zip(jax.tree.leaves(before.rows), jax.tree.leaves(memory.rows), strict=True):
+            np.testing.assert_array_equal(old[survivors], np.asarray(new)[survivors])
+    assert int(memory.rows_written) > 3 * memory.priorities.capacity
+
+
+def test_sampled_batches_are_aligned_after_wrap_around(key):
+    world = World(4, enclose=0.4)
+    memory = fill(world, empty(), 100)
+    by_obs = {row["obs"]: row for row in world.transitions}
+    for k in jax.random.split(key, 5):
+        batch = sample(memory, k, importance_exponent=0.4)
+        obs, goal = decode_input(batch.inputs)
+        next_obs, next_goal = decode_input(batch.next_inputs)
+        np.testing.assert_array_equal(goal, next_goal)
+        np.testing.assert_array_equal(goal, np.asarray(memory.rows.goal)[batch.rows])
+        for i, obs_id in enumerate(obs):
+            origin = by_obs[obs_id]
+            assert next_obs[i] == origin["next_obs"] and int(batch.action[i]) == origin["action"]
+            if not batch.hindsight[i]:
+                assert (goal[i], float(batch.reward[i])) == (origin["goal"], origin["reward"])
+                assert bool(batch.terminated[i]) == origin["terminated"]
+        row, col, _ = grid.decode_action(batch.action)
+        np.testing.assert_allclose(batch.next_p1, grid.cell_to_world(row, col), atol=1e-7)
+
+
+def test_truncated_rows_bootstrap():
+    world = World(5, enclose=0.0)
+    memory = fill(world, empty(capacity=100), MAX_PUSHES)
+    assert all(row["truncated"] for row in world.transitions[-NUM_ENVS:])
+    assert not np.any(memory.rows.terminated)
+    assert np.all(memory.episodes.ended) and np.all(np.asarray(memory.episodes.length) == MAX_PUSHES)
+
+
+def test_priorities_new_rows_get_the_largest_and_exponent_applies(key):
+    memory = fill(World(6), empty(capacity=100), 4, relabel=False)
+    np.testing.assert_array_equal(memory.priorities.leaves[:12], np.ones(12))
+    memory = set_priorities(memory, jnp.array([0, 1, 2]), jnp.array([-2.0, 0.0, 0.5]))
+    expected = (np.array([2.0, 0.0, 0.5]) + replay.MIN_TD_ERROR) ** 0.6
+    np.testing.assert_allclose(memory.priorities.leaves[:3], expected, rtol=1e-6)
+    memory = fill(World(7), memory, 1, relabel=False)
+    np.testing.assert_allclose(memory.priorities.leaves[12:15], expected.max(), rtol=1e-6)
+    assert int(memory.num_alive) == 15
+
+
+def test_sampling_follows_priorities_and_weights_undo_it(key):
+    memory = fill(World(8), empty(capacity=100), 4, relabel=False)
+    errors = jnp.linspace(0.1, 3.0, 12)
+    memory = set_priorities(memory, jnp.arange(12), errors)
+    batches = [sample(memory, k, importance_exponent=0.7) for k in jax.random.split(key, 60)]
+    drawn = np.concatenate([batch.rows for batch in batches])
+    priority = (np.asarray(errors) + replay.MIN_TD_ERROR) ** 0.6
+    probability = priority / priority.sum()
+    np.testing.assert_allclose(np.bincount(drawn, minlength=12) / len(drawn), probability, atol=0.02)
+    weights = (1 / (12 * probability)) ** 0.7
+    for batch in batches[:5]:
+        expected = weights[batch.rows] / weights[batch.rows].max()
+        np.testing.assert_allclose(batch.importance_weights, expected, rtol=1e-5)
+        assert float(batch.importance_weights.max()) == 1.0
+
+
+def test_dead_rows_stay_dead():
+    memory = fill(World(9), empty(capacity=30), 60)
+    dead = np.flatnonzero(np.asarray(memory.priorities.leaves) == 0)[:4]
+    after = set_priorities(memory, jnp.asarray(dead), jnp.full(4, 9.0))
+    np.testing.assert_array_equal(after.priorities.leaves, memory.priorities.leaves)
+
+
+def test_a_diverged_push_is_recorded_but_never_sampled(key):
+    steps = World(10, enclose=0.0).step()
+    diverged = jnp.array([False, True, False])
+    steps = steps.replace(outcome=steps.outcome.replace(diverged=diverged), terminated=diverged)
+    memory = add(empty(capacity=30), steps)
+    np.testing.assert_array_equal(memory.priorities.leaves[:4], [1, 0, 1, 0])
+    assert set(np.asarray(sample(memory, key, importance_exponent=1.0).rows)) == {0, 2}
+
+
+def test_counters():
+    world = World(13, enclose=0.5)
+    memory = fill(world, empty(capacity=1000), 30)
+    rows = alive_rows(memory)
+    assert int(memory.num_alive) == int(memory.rows_written) == len(rows)
+    assert int(memory.hindsight_rows_written) == sum(row[-1] for row in rows) == len(rows) - 30 * NUM_ENVS > 0
+
+
+def test_donated_memory_is_updated_in_place():
+    memory = empty(capacity=2000)
+    pointers = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(memory.observations)]
+    memory = fill(World(11), memory, 3)
+    assert [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(memory.observations)] == pointers
+
+
+def test_one_trace():
+    traces = []
+
+    @jax.jit
+    def counted(memory, steps):
+        traces.append(1)
+        return hindsight.add_hindsight(replay.add(memory, steps), ALL_ELIGIBLE)
+
+    world, memory = World(12), empty()
+    for _ in range(5):
+        memory = counted(memory, world.step())
+    assert len(traces) == 1
+
+
+def test_a_capacity_that_an_episode_could_outlive_is_refused():
+    smallest = 2 * NUM_ENVS * (MAX_PUSHES + 1)
+    empty(smallest)
+    with pytest.raises(ValueError, match=f"replay capacity = {smallest - 1} .* allowed is {smallest} or more"):
+        empty(smallest - 1)
+    shapes = jax.eval_shape(World(0).step)
+    assert replay.init(shapes, capacity=smallest, max_pushes=MAX_PUSHES).observations.height.shape == (smallest, 1, 2)
