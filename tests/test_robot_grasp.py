@@ -105,7 +105,7 @@ def grasp(shape, width, height, yaw):
     return moved[2], np.linalg.norm(moved[:2])
 
 
-@pytest.mark.parametrize("width", [0.02, 0.07, 0.1])
+@pytest.mark.parametrize("width", [0.02, 0.07, 0.105])
 def test_the_fingers_press_with_at_most_40_newton(width):
     spec = robot.load_spec()
     body = spec.worldbody.add_body(name="object", pos=[-0.28, 0, robot.PUSH_HEIGHT])
@@ -124,7 +124,8 @@ def test_the_fingers_press_with_at_most_40_newton(width):
             total += force[0]
     angle = data.joint("hand_left_driver").qpos[0]
     lever = 0.0549 * np.cos(angle) + 0.0025 * np.sin(angle)
-    assert total == pytest.approx(1.68 / 2 / lever, rel=0.05)
+    # Half of the tendon's 1.5 N m goes to each side; friction adds to it, because the pads slide forward as they close.
+    assert 0.75 / lever * 0.95 < total < 0.75 / lever * 1.2
     assert 10 < total <= 40
 
 
