@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -126,15 +128,15 @@ def test_observe_quantizes_and_refuses_unknown_cameras(bank, key):
     hulls = make_instances(
         [box_cloud((0.05, 0.05, 0), (0.11, 0.11, 0.06)), box_cloud((0, 0, 0.4), (0.04, 0.04, 0.5))], [1, 2]
     )
-    obs = heightmap.observe(hulls)
+    obs = jax.jit(heightmap.observe)(hulls)
     assert obs.height.dtype == obs.instance_ids.dtype == jnp.uint8
     assert obs.height[65, 65] == 51 and obs.instance_ids[65, 65] == 1  # 0.06 m of 0.30 m in 255 steps
     assert obs.height[54, 54] == 255 and obs.instance_ids[54, 54] == 2
-    through_pinhole = heightmap.observe(hulls, camera="pinhole")
+    through_pinhole = jax.jit(functools.partial(heightmap.observe, camera="pinhole"))(hulls)
     # A surface at 0.5 m seen from 1 m stays over its own cells: its points are unprojected with their depth.
     np.testing.assert_array_equal(through_pinhole.instance_ids[66:71, 66:71], 1)
     np.testing.assert_array_equal(through_pinhole.instance_ids[51:57, 51:57], 2)
-    same = heightmap.observe(hulls, camera=heightmap.overhead_camera())
+    same = jax.jit(lambda h, camera: heightmap.observe(h, camera=camera))(hulls, heightmap.overhead_camera())
     np.testing.assert_array_equal(same.height, through_pinhole.height)
     with pytest.raises(ValueError, match="camera 'fisheye' is unknown; allowed are orthographic, pinhole"):
         heightmap.observe(hulls, camera="fisheye")
