@@ -9,16 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pregrasp_jax import checkpoint, policy_file, replay_chunks, tree_files
+from pregrasp_jax.checkpoint import chunks, policy, state, trees
+from pregrasp_jax.checkpoint.chunks import Ring
 from pregrasp_jax.config import PRESETS, Config
-from pregrasp_jax.replay_chunks import Ring
 
 CAPACITY = 10
 
 
+def make_params(step: int) -> dict:
+    return {"conv": {"kernel": jnp.full((3, 2), step + 0.1), "bias": jnp.zeros(2)}}
+
+
 def make_tree(step: int) -> dict:
     return {
-        "learner": {"params": {"conv": {"kernel": jnp.full((3, 2), step + 0.1), "bias": jnp.zeros(2)}}},
+        "learning": {"learner": {"params": make_params(step)}},
         "key": jax.random.split(jax.random.key(step), 2),
         "steps": jnp.int32(step),
         "ended": jnp.array([True, False]),
@@ -41,11 +45,11 @@ def empty_ring(written: int) -> Ring:
 
 
 def save(folder: Path, step: int, written: int) -> Path:
-    return checkpoint.save(folder, step, make_tree(step), empty_ring(written), {"seconds": step / 3})
+    return state.save(folder, step, make_tree(step), empty_ring(written), {"seconds": step / 3})
 
 
-def restore(folder: Path) -> checkpoint.Restored:
-    return checkpoint.restore(folder, jax.eval_shape(make_tree, 0), make_ring(0).contents)
+def restore(folder: Path) -> state.Restored:
+    return state.restore(folder, jax.eval_shape(make_tree, 0), make_ring(0).contents)
 
 
 def flip_byte(path: Path, position: int = -20) -> None:
@@ -58,23 +62,23 @@ def flip_byte(path: Path, position: int = -20) -> None:
 def test_restores_bit_for_bit(tmp_path, written):
     save(tmp_path, 7, written)
     restored = restore(tmp_path)
-    assert tree_files.checksum(restored.tree) == tree_files.checksum(make_tree(7))
-    assert tree_files.checksum(restored.ring) == tree_files.checksum(empty_ring(written).contents)
+    assert trees.checksum(restored.tree) == trees.checksum(make_tree(7))
+    assert trees.checksum(restored.ring) == trees.checksum(empty_ring(written).contents)
     assert (restored.step, restored.extra, restored.problems) == (7, {"seconds": 7 / 3}, ())
     assert jnp.issubdtype(restored.tree["key"].dtype, jax.dtypes.prng_key)
 
 
 def test_checksum_sees_one_bit_and_one_name():
     tree = make_tree(3)
-    assert tree_files.checksum(tree) == tree_files.checksum(make_tree(3))
-    assert tree_files.checksum(tree) != tree_files.checksum(tree | {"steps": jnp.int32(2)})
-    assert tree_files.checksum({"a": jnp.zeros(1)}) != tree_files.checksum({"b": jnp.zeros(1)})
+    assert trees.checksum(tree) == trees.checksum(make_tree(3))
+    assert trees.checksum(tree) != trees.checksum(tree | {"steps": jnp.int32(2)})
+    assert trees.checksum({"a": jnp.zeros(1)}) != trees.checksum({"b": jnp.zeros(1)})
 
 
 def test_strided_arrays_are_stored_in_their_own_order():
     strided = np.arange(12, dtype=np.float32).reshape(3, 4).T[::2]
     assert not strided.flags["C_CONTIGUOUS"]
-    stored = tree_files.decode(tree_files.encode(tree_files.named_leaves({"a": strided})), origin="test")
+    stored = trees.decode(trees.encode(trees.named_leaves({"a": strided})), origin="test")
     np.testing.assert_array_equal(stored["a"], strided)
 
 
@@ -89,10 +93,10 @@ def test_a_checkpoint_writes_only_new_observations(tmp_path):
 
 
 def test_long_stretches_are_split(tmp_path, monkeypatch):
-    monkeypatch.setattr(replay_chunks, "CHUNK_LENGTH", 4)
+    monkeypatch.setattr(chunks, "CHUNK_LENGTH", 4)
     save(tmp_path, 1, 9)
     assert len(list((tmp_path / "replay").iterdir())) == 3
-    assert tree_files.checksum(restore(tmp_path).ring) == tree_files.checksum(empty_ring(9).contents)
+    assert trees.checksum(restore(tmp_path).ring) == trees.checksum(empty_ring(9).contents)
 
 
 def test_old_checkpoints_and_their_chunks_go(tmp_path):
@@ -126,7 +130,7 @@ def test_damage_falls_back_to_the_previous_checkpoint_and_says_so(tmp_path, dama
     damage(save(tmp_path, 2, 9))
     restored = restore(tmp_path)
     assert restored.step == 1 and len(restored.problems) == 1 and said in restored.problems[0]
-    assert tree_files.checksum(restored.tree) == tree_files.checksum(make_tree(1))
+    assert trees.checksum(restored.tree) == trees.checksum(make_tree(1))
     assert (tmp_path / "000000002.damaged").is_dir()
     assert restore(tmp_path).problems == ()
 
@@ -165,7 +169,7 @@ def test_a_lost_chunk_is_written_again_while_the_ring_still_holds_it(tmp_path):
     save(tmp_path, 1, 4)
     (tmp_path / "replay" / "000000000000-000000000004.npz").unlink()
     save(tmp_path, 2, 9)
-    assert tree_files.checksum(restore(tmp_path).ring) == tree_files.checksum(empty_ring(9).contents)
+    assert trees.checksum(restore(tmp_path).ring) == trees.checksum(empty_ring(9).contents)
 
 
 def test_refusals_are_one_line(tmp_path):
@@ -177,16 +181,16 @@ def test_refusals_are_one_line(tmp_path):
     save(tmp_path, 2, 4)
     wider = make_tree(0) | {"steps": jnp.zeros(3, jnp.int32)}
     with pytest.raises(ValueError, match=r"steps is int32\[\], this configuration needs int32\[3\]") as error:
-        checkpoint.restore(tmp_path, wider, make_ring(0).contents)
+        state.restore(tmp_path, wider, make_ring(0).contents)
     assert "\n" not in str(error.value)
     with pytest.raises(ValueError, match="extra is missing"):
-        checkpoint.restore(tmp_path, make_tree(0) | {"extra": jnp.zeros(1)}, make_ring(0).contents)
+        state.restore(tmp_path, make_tree(0) | {"extra": jnp.zeros(1)}, make_ring(0).contents)
     with pytest.raises(ValueError, match="ended is not part of this configuration"):
-        checkpoint.restore(tmp_path, {k: v for k, v in make_tree(0).items() if k != "ended"}, make_ring(0).contents)
+        state.restore(tmp_path, {k: v for k, v in make_tree(0).items() if k != "ended"}, make_ring(0).contents)
 
 
 def test_another_version_is_refused_not_skipped(tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoint, "FORMAT", 99)
+    monkeypatch.setattr(state, "FORMAT", 99)
     save(tmp_path, 1, 4)
     monkeypatch.undo()
     with pytest.raises(ValueError, match="format 99"):
@@ -194,40 +198,40 @@ def test_another_version_is_refused_not_skipped(tmp_path, monkeypatch):
 
 
 def test_policy_round_trip_from_file_folder_and_run(tmp_path):
-    params = make_tree(5)["learner"]["params"]
+    params = make_params(5)
     config = PRESETS["ci"]
-    policy_file.save_policy(tmp_path / "best", params, config, {"success_rate": 0.5, "env_steps": 80})
+    policy.save_policy(tmp_path / "best", params, config, {"success_rate": 0.5, "env_steps": 80})
     for path in (tmp_path, tmp_path / "best", tmp_path / "best" / "params.safetensors"):
-        policy = policy_file.load_policy(path)
-        assert tree_files.checksum(policy.params) == tree_files.checksum(params)
-        assert policy.config == config and policy.evaluation["success_rate"] == 0.5
+        loaded = policy.load_policy(path)
+        assert trees.checksum(loaded.params) == trees.checksum(params)
+        assert loaded.config == config and loaded.evaluation["success_rate"] == 0.5
     assert json.loads((tmp_path / "best" / "evaluation.json").read_text())["env_steps"] == 80
-    assert policy_file.read_config(tmp_path / "best" / "config.yaml") == config
+    assert policy.read_config(tmp_path / "best" / "config.yaml") == config
 
 
 def test_a_run_without_best_policy_gives_its_latest_checkpoint(tmp_path):
     checkpoints = tmp_path / "checkpoints"
-    policy_file.write_config(tmp_path / "config.yaml", Config())
+    policy.write_config(tmp_path / "config.yaml", Config())
     save(checkpoints, 1, 4)
     flip_byte(save(checkpoints, 2, 9) / "state.safetensors")
-    policy = policy_file.load_policy(tmp_path)
-    assert tree_files.checksum(policy.params) == tree_files.checksum(make_tree(1)["learner"]["params"])
+    loaded = policy.load_policy(tmp_path)
+    assert trees.checksum(loaded.params) == trees.checksum(make_params(1))
     assert (checkpoints / "000000002").is_dir(), "reading a policy must not change the run"
 
 
 def test_policy_refusals(tmp_path):
     with pytest.raises(ValueError, match="does not exist; allowed"):
-        policy_file.load_policy(tmp_path / "nothing")
+        policy.load_policy(tmp_path / "nothing")
     with pytest.raises(ValueError, match="neither a run folder nor a policy folder"):
-        policy_file.load_policy(tmp_path)
+        policy.load_policy(tmp_path)
     foreign = tmp_path / "foreign.safetensors"
-    foreign.write_bytes(tree_files.encode({"a": np.zeros(3)}))
+    foreign.write_bytes(trees.encode({"a": np.zeros(3)}))
     with pytest.raises(ValueError, match="not written by this package"):
-        policy_file.load_policy(foreign)
+        policy.load_policy(foreign)
     foreign.write_bytes(b"not a policy")
     with pytest.raises(ValueError, match="damaged or not safetensors"):
-        policy_file.load_policy(foreign)
-    policy_file.save_policy(tmp_path, make_tree(5)["learner"]["params"], Config(), {})
+        policy.load_policy(foreign)
+    policy.save_policy(tmp_path, make_params(5), Config(), {})
     flip_byte(tmp_path / "params.safetensors", -1)
     with pytest.raises(ValueError, match="altered"):
-        policy_file.load_policy(tmp_path)
+        policy.load_policy(tmp_path)

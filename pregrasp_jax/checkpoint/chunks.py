@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from pregrasp_jax import io
-from pregrasp_jax.tree_files import DamagedFileError, leaf_names, rebuild
+from pregrasp_jax.checkpoint.trees import DamagedFileError, leaf_names, rebuild
 
 CHUNK_LENGTH = 2048
 """Observations per file at most: 40 MB before compression."""

@@ -12,14 +12,16 @@ from typing import Any
 
 import yaml
 
-from pregrasp_jax import checkpoint, io, tree_files
+from pregrasp_jax import io
+from pregrasp_jax.checkpoint import trees
+from pregrasp_jax.checkpoint.state import read_newest_arrays
+from pregrasp_jax.checkpoint.trees import DamagedFileError
 from pregrasp_jax.config import Config, from_dict, to_dict
-from pregrasp_jax.tree_files import DamagedFileError
 
 FORMAT = 1
 """Version of the header of a policy."""
 
-PARAMS_PREFIX = "learner/params/"
+PARAMS_PREFIX = "learning/learner/params/"
 """Where a training state keeps what a policy needs."""
 
 _PARAMS = "params.safetensors"
@@ -44,14 +46,14 @@ class Policy:
 
 def save_policy(folder: Path, params: Any, config: Config, evaluation: dict[str, Any]) -> None:
     """Write a policy. `params.safetensors` alone is complete; the two other files repeat its header for people."""
-    arrays = tree_files.named_leaves(params)
+    arrays = trees.named_leaves(params)
     metadata = {
         "format": f"pregrasp_jax policy {FORMAT}",
         "config": json.dumps(to_dict(config)),
         "evaluation": json.dumps(evaluation),
-        "checksum": tree_files.checksum(params),
+        "checksum": trees.checksum(params),
     }
-    io.write_bytes(folder / _PARAMS, tree_files.encode(arrays, metadata))
+    io.write_bytes(folder / _PARAMS, trees.encode(arrays, metadata))
     write_config(folder / "config.yaml", config)
     io.write_json(folder / "evaluation.json", evaluation)
 
@@ -92,20 +94,20 @@ def read_config(path: Path) -> Config:
 
 def _read_policy(path: Path) -> Policy:
     data = path.read_bytes()
-    arrays = tree_files.decode(data, origin=str(path))
+    arrays = trees.decode(data, origin=str(path))
     try:
-        metadata = tree_files.read_metadata(data)
+        metadata = trees.read_metadata(data)
         config = from_dict(json.loads(metadata["config"]))
         evaluation, expected = json.loads(metadata["evaluation"]), metadata["checksum"]
     except (KeyError, json.JSONDecodeError):
         raise ValueError(f"{path} was not written by this package: its header names no config") from None
-    params = tree_files.nest(arrays)
-    if tree_files.checksum(params) != expected:
+    params = trees.nest(arrays)
+    if trees.checksum(params) != expected:
         raise DamagedFileError(f"{path} is altered (checksum differs)")
     return Policy(params, config, evaluation, path)
 
 
 def _policy_of_checkpoint(folder: Path, config: Config) -> Policy:
-    arrays, origin = checkpoint.read_newest_arrays(folder)
+    arrays, origin = read_newest_arrays(folder)
     params = {name.removeprefix(PARAMS_PREFIX): leaf for name, leaf in arrays.items() if name.startswith(PARAMS_PREFIX)}
-    return Policy(tree_files.nest(params), config, {}, origin)
+    return Policy(trees.nest(params), config, {}, origin)

@@ -3,7 +3,7 @@
     checkpoints/
         000012800/state.safetensors     every leaf of the training state but the observations
                   manifest.json         written last: without it the checkpoint does not exist
-        replay/000000000000-....npz     observations, append-only (see `replay_chunks`)
+        replay/000000000000-....npz     observations, append-only (see `chunks`)
 
 Every file carries a checksum. A damaged checkpoint is set aside and the one before it is used.
 """
@@ -19,9 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from pregrasp_jax import io, replay_chunks, tree_files
-from pregrasp_jax.replay_chunks import Chunk, Ring
-from pregrasp_jax.tree_files import DamagedFileError
+from pregrasp_jax import io
+from pregrasp_jax.checkpoint import chunks, trees
+from pregrasp_jax.checkpoint.chunks import Chunk, Ring
+from pregrasp_jax.checkpoint.trees import DamagedFileError
 
 FORMAT = 1
 """Version of the layout above."""
@@ -69,17 +70,17 @@ def save(folder: Path, step: int, tree: Any, ring: Ring, extra: dict[str, Any]) 
     target = folder / f"{step:09d}"
     # An unfinished or outdated checkpoint of the same step must not gain a manifest that does not match it.
     (target / _MANIFEST).unlink(missing_ok=True)
-    known = {chunk for path in _newest_first(folder) for chunk in _chunks(path)}
-    chunks = replay_chunks.append(folder / _REPLAY, ring, sorted(known))
-    state = tree_files.encode(tree_files.named_leaves(tree))
+    known = {chunk for path in _newest_first(folder) for chunk in _listed_chunks(path)}
+    current = chunks.append(folder / _REPLAY, ring, sorted(known))
+    state = trees.encode(trees.named_leaves(tree))
     io.write_bytes(target / _STATE, state)
     manifest = {
         "format": FORMAT,
         "step": step,
         "state_sha256": hashlib.sha256(state).hexdigest(),
-        "state_checksum": tree_files.checksum(tree),
+        "state_checksum": trees.checksum(tree),
         "observations": ring.written,
-        "chunks": [list(chunk) for chunk in chunks],
+        "chunks": [list(chunk) for chunk in current],
         "extra": extra,
     }
     io.write_json(target / _MANIFEST, {"checksum": io.content_hash(manifest), **manifest})
@@ -102,9 +103,9 @@ def restore(folder: Path, template: Any, ring_template: Any) -> Restored:
     for path in _newest_first(folder):
         try:
             manifest = _read_manifest(path)
-            tree = tree_files.rebuild(template, _read_state(path, manifest), origin=str(path / _STATE))
-            chunks = [Chunk(*row) for row in manifest["chunks"]]
-            ring = replay_chunks.restore(folder / _REPLAY, ring_template, manifest["observations"], chunks)
+            tree = trees.rebuild(template, _read_state(path, manifest), origin=str(path / _STATE))
+            listed = [Chunk(*row) for row in manifest["chunks"]]
+            ring = chunks.restore(folder / _REPLAY, ring_template, manifest["observations"], listed)
         except DamagedFileError as error:
             damaged[path] = str(error)
             continue
@@ -160,10 +161,10 @@ def _read_state(path: Path, manifest: dict[str, Any]) -> dict[str, np.ndarray]:
         raise DamagedFileError(f"{path / _STATE} cannot be read ({error.strerror})") from None
     if hashlib.sha256(data).hexdigest() != manifest["state_sha256"]:
         raise DamagedFileError(f"{path / _STATE} is cut short or altered (checksum differs)")
-    return tree_files.decode(data, origin=str(path / _STATE))
+    return trees.decode(data, origin=str(path / _STATE))
 
 
-def _chunks(path: Path) -> list[Chunk]:
+def _listed_chunks(path: Path) -> list[Chunk]:
     """Return the chunks that a checkpoint refers to; none if its manifest is damaged."""
     try:
         return [Chunk(*row) for row in _read_manifest(path)["chunks"]]
@@ -177,7 +178,7 @@ def _prune(folder: Path) -> None:
     for path in folder.glob("*"):
         if path.name.isdigit() and path not in kept:
             shutil.rmtree(path, ignore_errors=True)
-    replay_chunks.collect_garbage(folder / _REPLAY, {chunk.name for path in kept for chunk in _chunks(path)})
+    chunks.collect_garbage(folder / _REPLAY, {chunk.name for path in kept for chunk in _listed_chunks(path)})
 
 
 def _set_aside(path: Path) -> None:

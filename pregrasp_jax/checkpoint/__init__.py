@@ -1,0 +1,19 @@
+"""Checkpoints of the whole training state, and policies that can be loaded without it."""
+
+from pregrasp_jax.checkpoint.chunks import Ring
+from pregrasp_jax.checkpoint.policy import Policy, load_policy, read_config, save_policy, write_config
+from pregrasp_jax.checkpoint.state import Restored, restore, save
+from pregrasp_jax.checkpoint.trees import checksum
+
+__all__ = [
+    "Policy",
+    "Restored",
+    "Ring",
+    "checksum",
+    "load_policy",
+    "read_config",
+    "restore",
+    "save",
+    "save_policy",
+    "write_config",
+]

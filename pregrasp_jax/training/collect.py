@@ -1,0 +1,238 @@
+"""The actors: E scenes, each pushed once per call, by an epsilon-greedy policy.
+
+`collect` touches neither replay nor learner. Its only input from learning is a set of parameters, so the
+physics of the next push may run while the learner still digests the last one.
+"""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import flax.struct as struct
+import jax
+import jax.numpy as jnp
+
+from pregrasp_jax import exploration
+from pregrasp_jax.config import ExplorationConfig
+from pregrasp_jax.judge import TARGET_IN_REGION
+from pregrasp_jax.learning.learner import ApplyFn, Params, greedy_action
+from pregrasp_jax.learning.replay import InputFn, Steps
+from pregrasp_jax.types import REASONS, EnvState, HullBank, StepResult
+
+RECENT_EPISODES = 200
+"""Episodes behind `train/success_rate`, or one per scene where there are more scenes."""
+
+
+class Environment(Protocol):
+    """What training asks of `pregrasp_jax.env.Env`."""
+
+    @property
+    def bank(self) -> HullBank:
+        """The objects."""
+        ...
+
+    def reset(self, key: jax.Array) -> EnvState:
+        """Return a random scene."""
+        ...
+
+    def step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, StepResult]:
+        """Execute one push."""
+        ...
+
+    def action_mask(self, p1: jax.Array) -> jax.Array:
+        """Return the cells [H, W] bool in which the next push may end."""
+        ...
+
+
+class Tally(struct.PyTreeNode):
+    """What happened, counted on the device, so that the loop need not wait for numbers it only prints.
+
+    Attributes:
+        env_steps: () int32 pushes ever.
+        episodes: () int32 ended ever.
+        recent: [W] int8 reasons of the last W episodes, a ring; -1 where there was none yet.
+        pushes: () int32 since the last report.
+        reward: () float32 summed over them.
+        explored: () int32 of them were random.
+        reasons: [len(REASONS)] int32 why episodes ended since the last report.
+    """
+
+    env_steps: jax.Array
+    episodes: jax.Array
+    recent: jax.Array
+    pushes: jax.Array
+    reward: jax.Array
+    explored: jax.Array
+    reasons: jax.Array
+
+    def begin_report(self) -> "Tally":
+        """Return the tally with the counts since the last report at 0."""
+        return self.replace(
+            pushes=jnp.int32(0), reward=jnp.float32(0), explored=jnp.int32(0), reasons=jnp.zeros_like(self.reasons)
+        )
+
+
+class Actors(struct.PyTreeNode):
+    """State of the actors.
+
+    Attributes:
+        env_states: of E scenes.
+        key: PRNG key of actions and resets.
+        tally: counts.
+    """
+
+    env_states: EnvState
+    key: jax.Array
+    tally: Tally
+
+
+class Experience(struct.PyTreeNode):
+    """What one push of every scene hands to the learner.
+
+    Attributes:
+        steps: one transition per scene.
+        eligible: [E, MAX_OBJECTS] bool, slots whose object may be a hindsight goal.
+        episodes: () int32 ended ever, this push included.
+    """
+
+    steps: Steps
+    eligible: jax.Array
+    episodes: jax.Array
+
+
+CollectFn = Callable[[Actors, Params], tuple[Actors, Experience]]
+"""``(actors, params) -> (actors, experience)``."""
+
+
+def init_actors(key: jax.Array, env: Environment, num_envs: int) -> Actors:
+    """Return `num_envs` scenes at the start of an episode."""
+    key, reset_key = jax.random.split(key)
+    tally = Tally(
+        env_steps=jnp.int32(0),
+        episodes=jnp.int32(0),
+        recent=jnp.full(max(RECENT_EPISODES, num_envs), -1, jnp.int8),
+        pushes=jnp.int32(0),
+        reward=jnp.float32(0),
+        explored=jnp.int32(0),
+        reasons=jnp.zeros(len(REASONS), jnp.int32),
+    )
+    return Actors(jax.vmap(env.reset)(jax.random.split(reset_key, num_envs)), key, tally)
+
+
+def make_collect(
+    env: Environment, apply_fn: ApplyFn, input_fn: InputFn, config: ExplorationConfig, *, warmup: int
+) -> CollectFn:
+    """Return the function that pushes once in every scene and resets those that ended.
+
+    Args:
+        env: the scenes.
+        apply_fn: the network on a batch.
+        input_fn: what the network sees of an observation.
+        config: exploration.
+        warmup: env steps of pure exploration.
+    """
+
+    def explore(key: jax.Array, state: EnvState, mask: jax.Array) -> jax.Array:
+        if not config.guided:
+            return exploration.random_action(key)
+        target_xy = state.centroids[state.scene.target]
+        return exploration.guided_action(
+            key,
+            state.p1,
+            target_xy,
+            mask,
+            angle_std=config.angle_std,
+            open_probability=config.open_probability,
+        )
+
+    def greedy(params: Params, states: EnvState, masks: jax.Array) -> jax.Array:
+        inputs = jax.vmap(input_fn)(states.obs, states.scene.target)
+        return jax.vmap(greedy_action)(apply_fn(params, inputs), masks)
+
+    def act(key: jax.Array, params: Params, states: EnvState, epsilon: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return actions [E] and which of them are random [E]."""
+        num_envs = states.p1.shape[0]
+        masks = jax.vmap(env.action_mask)(states.p1)
+        explore_key, choice_key = jax.random.split(key)
+        exploratory = jax.vmap(explore)(jax.random.split(explore_key, num_envs), states, masks)
+        random = jax.random.uniform(choice_key, (num_envs,)) < epsilon
+        # While all actions are random the network need not be asked.
+        best = jax.lax.cond(jnp.all(random), lambda *_: exploratory, greedy, params, states, masks)
+        return jnp.where(random, exploratory, best), random
+
+    def collect(actors: Actors, params: Params) -> tuple[Actors, Experience]:
+        states = actors.env_states
+        key, action_key, reset_key = jax.random.split(actors.key, 3)
+        epsilon = epsilon_at(actors.tally.env_steps, config, warmup=warmup)
+        actions, random = act(action_key, params, states, epsilon)
+        next_states, results = jax.vmap(env.step)(states, actions)
+        ended = results.terminated | results.truncated
+        tally = _count(actors.tally, results, ended, random)
+        fresh = jax.vmap(env.reset)(jax.random.split(reset_key, ended.shape[0]))
+        experience = Experience(
+            _steps(states, actions, results, next_states), _eligible(env.bank, states), tally.episodes
+        )
+        return Actors(_select(ended, fresh, next_states), key, tally), experience
+
+    return collect
+
+
+def epsilon_at(env_steps: jax.Array | int, config: ExplorationConfig, *, warmup: int) -> jax.Array:
+    """Return the share of random actions () after `env_steps` pushes; 1 during the warm-up."""
+    decayed = exploration.linear_schedule(
+        env_steps, start=config.epsilon_start, end=config.epsilon_end, steps=config.epsilon_decay
+    )
+    return jnp.where(env_steps < warmup, 1.0, decayed)
+
+
+def _steps(states: EnvState, actions: jax.Array, results: StepResult, next_states: EnvState) -> Steps:
+    return Steps(
+        obs=states.obs,
+        action=actions,
+        goal=states.scene.target,
+        outcome=results.outcome,
+        reward=results.reward,
+        terminated=results.terminated,
+        truncated=results.truncated,
+        next_obs=next_states.obs,
+    )
+
+
+def _eligible(bank: HullBank, states: EnvState) -> jax.Array:
+    object_ids = states.scene.object_ids
+    return jnp.asarray(bank.eligible)[object_ids] & (object_ids >= 0)
+
+
+def _select(ended: jax.Array, fresh: Any, going_on: Any) -> Any:
+    """Return `fresh` where `ended` [E], for every leaf [E, ...]."""
+    return jax.vmap(lambda e, a, b: jax.tree.map(lambda x, y: jnp.where(e, x, y), a, b))(ended, fresh, going_on)
+
+
+def _count(tally: Tally, results: StepResult, ended: jax.Array, random: jax.Array) -> Tally:
+    window = tally.recent.shape[0]
+    order = jnp.cumsum(ended, dtype=jnp.int32) - 1
+    slots = jnp.where(ended, (tally.episodes + order) % window, window)
+    return Tally(
+        env_steps=tally.env_steps + ended.shape[0],
+        episodes=tally.episodes + jnp.sum(ended, dtype=jnp.int32),
+        recent=tally.recent.at[slots].set(results.reason.astype(jnp.int8), mode="drop"),
+        pushes=tally.pushes + ended.shape[0],
+        reward=tally.reward + jnp.sum(results.reward),
+        explored=tally.explored + jnp.sum(random, dtype=jnp.int32),
+        reasons=tally.reasons.at[results.reason].add(ended.astype(jnp.int32)),
+    )
+
+
+def report(tally: Tally) -> dict[str, Any]:
+    """Return the row of metrics () of a tally, on the host; shares without a case are None."""
+    counts = jax.device_get(tally)
+    recent = counts.recent[counts.recent >= 0]
+    episodes = int(counts.reasons.sum())
+    return {
+        "env_steps": int(counts.env_steps),
+        "episodes": int(counts.episodes),
+        "train/success_rate": float((recent == TARGET_IN_REGION).mean()) if len(recent) else None,
+        "train/reward": float(counts.reward / counts.pushes) if counts.pushes else None,
+        "train/episode_length": float(counts.pushes / episodes) if episodes else None,
+        "train/explored": float(counts.explored / counts.pushes) if counts.pushes else None,
+        **{f"reasons/{name}": int(n) for name, n in zip(REASONS, counts.reasons, strict=True) if name != "running"},
+    }

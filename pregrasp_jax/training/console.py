@@ -1,0 +1,90 @@
+"""Progress of a training on the console: a live bar on a terminal, plain lines elsewhere."""
+
+import sys
+import time
+from typing import Any, TextIO
+
+from rich.console import Console as RichConsole
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+PLAIN_INTERVAL = 10.0
+"""s between plain lines: a log file is read, not watched."""
+
+
+class Console:
+    """Says what a training does."""
+
+    def __init__(self, stream: TextIO | None = None):
+        """Choose live or plain.
+
+        Args:
+            stream: standard output if None.
+        """
+        self._rich = RichConsole(file=stream or sys.stdout, highlight=False, soft_wrap=True)
+        self._last_line = -PLAIN_INTERVAL
+        self._progress = Progress(
+            TextColumn("{task.percentage:3.0f} %"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.description}", markup=False),
+            TimeElapsedColumn(),
+            console=self._rich,
+            disable=not self._rich.is_terminal,
+            transient=True,
+        )
+        self._task = self._progress.add_task("waiting for the first episodes", total=1.0)
+
+    def say(self, line: str) -> None:
+        """Print one line above the bar."""
+        self._rich.print(line, markup=False)
+
+    def start(self) -> None:
+        """Show the bar."""
+        self._progress.start()
+
+    def update(self, row: dict[str, Any], *, share: float, eta: float | None) -> None:
+        """Show a row of metrics.
+
+        Args:
+            row: of metrics.jsonl.
+            share: of the run that is done, 0 to 1.
+            eta: s left; None if unknown.
+        """
+        text = describe(row, eta)
+        self._progress.update(self._task, completed=share, description=text)
+        if not self._rich.is_terminal and time.monotonic() - self._last_line >= PLAIN_INTERVAL:
+            self._last_line = time.monotonic()
+            self.say(f"{100 * share:3.0f} % {text}")
+
+    def close(self) -> None:
+        """Remove the bar and give the cursor back."""
+        self._progress.stop()
+
+
+def describe(row: dict[str, Any], eta: float | None) -> str:
+    """Return what matters of a row of metrics in one line."""
+    parts = [
+        f"step {row['env_steps']}",
+        f"episode {row['episodes']}",
+        f"success {_percent(row['train/success_rate'])}",
+        f"epsilon {row['train/epsilon']:.2f}",
+        f"loss {_number(row['train/loss'])}",
+        f"{row['time/env_steps_per_second']:.1f} steps/s",
+        f"left {format_time(eta)}",
+    ]
+    return " | ".join(parts)
+
+
+def format_time(seconds: float | None) -> str:
+    """Return seconds as h:mm:ss, or a question mark."""
+    if seconds is None:
+        return "?"
+    minutes, second = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{second:02d}"
+
+
+def _percent(share: float | None) -> str:
+    return "?" if share is None else f"{100 * share:.0f} %"
+
+
+def _number(value: float | None) -> str:
+    return "?" if value is None else f"{value:.2g}"

@@ -1,0 +1,185 @@
+"""The learner's side of training: remember a push of every scene, then update a given number of times."""
+
+from collections.abc import Callable
+from typing import Any
+
+import flax.struct as struct
+import jax
+import jax.numpy as jnp
+import optax
+
+from pregrasp_jax.config import LearnerConfig, ReplayConfig
+from pregrasp_jax.learning import hindsight, learner
+from pregrasp_jax.learning import replay as replay_lib
+from pregrasp_jax.learning.learner import ApplyFn, LearnerState, MaskFn, Params, QAtFn
+from pregrasp_jax.learning.replay import InputFn, Replay, Steps
+from pregrasp_jax.training.collect import Experience
+
+
+class Learning(struct.PyTreeNode):
+    """State of the learner.
+
+    Attributes:
+        learner: parameters, target parameters, optimizer, gradient steps.
+        replay: memory, and where the running episodes lie in it.
+        key: PRNG key of sampling.
+        updates: () int32 since the last report.
+        metrics: of those updates: the largest of ``*_max``, the smallest of ``*_min``, sums of all others.
+    """
+
+    learner: LearnerState
+    replay: Replay
+    key: jax.Array
+    updates: jax.Array
+    metrics: dict[str, jax.Array]
+
+    def begin_report(self) -> "Learning":
+        """Return the state with updates and metrics counted anew."""
+        return self.replace(updates=jnp.int32(0), metrics=jax.tree.map(jnp.zeros_like, self.metrics))
+
+
+LearnFn = Callable[[Learning, Experience, Any, Any], Learning]
+"""``(state, experience, updates () int32, beta () float32) -> state``."""
+
+
+def num_updates(env_steps: int, config: LearnerConfig) -> int:
+    """Return how many updates are due in all after `env_steps` pushes; fractions wait until they add up to one."""
+    return int(max(0, env_steps - config.warmup) * config.updates_per_step)
+
+
+def init_learning(
+    key: jax.Array,
+    params: Params,
+    steps: Steps,
+    replay_config: ReplayConfig,
+    optimizer: optax.GradientTransformation,
+    *,
+    max_pushes: int,
+) -> Learning:
+    """Return a learner without experience.
+
+    Args:
+        key: for sampling.
+        params: initial parameters.
+        steps: a `Steps` of E scenes, or its shapes.
+        replay_config: capacity.
+        optimizer: see `make_optimizer`.
+        max_pushes: longest episode.
+    """
+    return Learning(
+        learner=learner.init(params, optimizer),
+        replay=replay_lib.init(steps, capacity=replay_config.capacity, max_pushes=max_pushes),
+        key=key,
+        updates=jnp.int32(0),
+        metrics={name: jnp.float32(0) for name in METRICS},
+    )
+
+
+def make_learn(
+    *,
+    apply_fn: ApplyFn,
+    q_at_fn: QAtFn,
+    mask_fn: MaskFn,
+    input_fn: InputFn,
+    optimizer: optax.GradientTransformation,
+    config: LearnerConfig,
+    replay_config: ReplayConfig,
+) -> LearnFn:
+    """Return the function that remembers one push of every scene, then updates; beta is the importance exponent.
+
+    Args:
+        apply_fn: the network on the whole grid.
+        q_at_fn: the network at the taken actions.
+        mask_fn: the half ring.
+        input_fn: fuses an observation for a goal.
+        optimizer: see `make_optimizer`.
+        config: discount, loss, batch.
+        replay_config: prioritization and hindsight.
+    """
+
+    def update_once(_: Any, carry: tuple[Learning, jax.Array]) -> tuple[Learning, jax.Array]:
+        state, beta = carry
+        key, sample_key = jax.random.split(state.key)
+        batch = replay_lib.sample(
+            state.replay, sample_key, batch_size=config.batch_size, importance_exponent=beta, input_fn=input_fn
+        )
+        learner_state, td_errors, metrics = learner.update(
+            state.learner,
+            batch,
+            apply_fn=apply_fn,
+            mask_fn=mask_fn,
+            optimizer=optimizer,
+            q_at_fn=q_at_fn,
+            discount=config.discount,
+            polyak=config.polyak,
+            huber_delta=config.huber_delta,
+        )
+        replay = replay_lib.set_priorities(
+            state.replay, batch.rows, td_errors, priority_exponent=replay_config.priority_exponent
+        )
+        metrics = _accumulate(state.metrics, metrics, state.updates)
+        return Learning(learner_state, replay, key, state.updates + 1, metrics), beta
+
+    def learn(state: Learning, experience: Experience, updates: jax.Array, beta: jax.Array) -> Learning:
+        replay = replay_lib.add(state.replay, experience.steps)
+        if replay_config.hindsight:
+            replay = hindsight.add_hindsight(replay, experience.eligible)
+        updates = jnp.where(replay.num_alive > 0, updates, 0)
+        return jax.lax.fori_loop(0, updates, update_once, (state.replace(replay=replay), beta))[0]
+
+    return learn
+
+
+def make_optimizer(config: LearnerConfig) -> optax.GradientTransformation:
+    """Return Adam."""
+    return optax.adam(config.learning_rate)
+
+
+METRICS = (
+    "train/loss",
+    "train/td_error",
+    "train/target_mean",
+    "train/target_min",
+    "train/target_max",
+    "train/q_taken",
+    "train/grad_norm",
+    "train/share_success",
+    "train/share_approach",
+    "train/share_nothing",
+    "train/share_hindsight",
+)
+"""What `learner.update` measures."""
+
+
+def _accumulate(total: dict[str, jax.Array], new: dict[str, jax.Array], count: jax.Array) -> dict[str, jax.Array]:
+    def merge(name: str) -> jax.Array:
+        if name.endswith("_max"):
+            return jnp.where(count == 0, new[name], jnp.maximum(total[name], new[name]))
+        if name.endswith("_min"):
+            return jnp.where(count == 0, new[name], jnp.minimum(total[name], new[name]))
+        return total[name] + new[name]
+
+    return {name: merge(name) for name in METRICS}
+
+
+def report(state: Learning) -> dict[str, Any]:
+    """Return the row of metrics () of a learner, on the host; averages over no update are None."""
+    small = (state.learner.gradient_steps, state.updates, state.metrics)
+    gradient_steps, updates, metrics = jax.device_get(small)
+    replay = state.replay
+    sizes = (replay.num_alive, replay.observations_written, replay.hindsight_rows_written, replay.rows_written)
+    alive, observations, hindsight_rows, rows = map(int, jax.device_get(sizes))
+
+    def value(name: str) -> float | None:
+        if not updates:
+            return None
+        return float(metrics[name]) / (1 if name.endswith(("_max", "_min")) else int(updates))
+
+    return {
+        "gradient_steps": int(gradient_steps),
+        **{name: value(name) for name in METRICS},
+        "replay/size": min(observations, replay.observations.height.shape[0]),
+        "replay/alive_rows": alive,
+        "replay/rows": rows,
+        "replay/her_rows": hindsight_rows,
+    }

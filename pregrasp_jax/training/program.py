@@ -1,0 +1,173 @@
+"""The compiled parts of a training and the state that they share."""
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import flax.linen as nn
+import flax.struct as struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pregrasp_jax import heightmap, io
+from pregrasp_jax.checkpoint.chunks import Ring
+from pregrasp_jax.config import Config
+from pregrasp_jax.learning.learner import Params
+from pregrasp_jax.learning.networks import QNetwork
+from pregrasp_jax.learning.replay import InputFn
+from pregrasp_jax.training.collect import Actors, CollectFn, Environment, Experience, init_actors, make_collect
+from pregrasp_jax.training.learn import LearnFn, Learning, init_learning, make_learn, make_optimizer
+
+CACHE_SWITCH = "PREGRASP_JAX_COMPILATION_CACHE"
+"""Environment variable: 0 turns the compilation cache off."""
+
+
+class TrainState(struct.PyTreeNode):
+    """Everything that a training must remember; two equal ones continue equally.
+
+    Attributes:
+        actors: the scenes.
+        learning: the learner and its memory.
+    """
+
+    actors: Actors
+    learning: Learning
+
+    def split(self) -> tuple["TrainState", Any]:
+        """Return the state without the observations of the replay, and those."""
+        replay = self.learning.replay
+        rest = self.replace(learning=self.learning.replace(replay=replay.replace(observations=None)))
+        return rest, replay.observations
+
+    def join(self, observations: Any) -> "TrainState":
+        """Inverse of `split`."""
+        replay = self.learning.replay.replace(observations=observations)
+        return self.replace(learning=self.learning.replace(replay=replay))
+
+    def ring(self) -> Ring:
+        """Return the observations as a checkpoint saves them."""
+        replay = self.learning.replay
+        return Ring(replay.observations, int(replay.observations_written))
+
+
+@dataclass(frozen=True)
+class Program:
+    """What a training runs.
+
+    Attributes:
+        init: ``key -> TrainState``.
+        collect: pushes once in every scene; donates the actors.
+        learn: remembers and updates; donates the learning state.
+    """
+
+    init: Callable[[jax.Array], TrainState]
+    collect: CollectFn
+    learn: LearnFn
+
+    def shapes(self) -> TrainState:
+        """Return the shapes of the state without making one."""
+        return jax.eval_shape(self.init, jax.random.key(0))
+
+    def compile(self, state: TrainState) -> tuple["Program", float]:
+        """Return the program with `collect` and `learn` compiled for a state, and the seconds that it took.
+
+        Compiled ahead, a function that would need a second trace fails instead of compiling in silence.
+        """
+        start = time.perf_counter()
+        params = state.learning.learner.params
+        collect = jax.jit(self.collect, donate_argnums=0).lower(state.actors, params).compile()
+        experience = jax.eval_shape(self.collect, state.actors, params)[1]
+        learn = (
+            jax.jit(self.learn, donate_argnums=0)
+            .lower(state.learning, experience, np.int32(0), np.float32(0))
+            .compile()
+        )
+        return Program(self.init, collect, learn), time.perf_counter() - start
+
+
+def make_program(
+    env: Environment,
+    config: Config,
+    *,
+    params: Params | None = None,
+    input_fn: InputFn = heightmap.network_input,
+    network: nn.Module | None = None,
+) -> Program:
+    """Return the program of a configuration, not compiled.
+
+    Args:
+        env: the training scenes.
+        config: the run.
+        params: initial parameters; drawn from the seed if None.
+        input_fn: what the network sees of an observation.
+        network: `QNetwork(width=config.network.width)` if None; it must have `q_of_action` too.
+
+    Raises:
+        ValueError: `params` do not fit the network.
+    """
+    network = network or QNetwork(width=config.network.width)
+    optimizer = make_optimizer(config.learner)
+
+    def apply_fn(params: Params, inputs: jax.Array) -> jax.Array:
+        return network.apply({"params": params}, inputs)  # pyright: ignore[reportReturnType]
+
+    def q_at_fn(params: Params, inputs: jax.Array, action: jax.Array) -> jax.Array:
+        return network.apply({"params": params}, inputs, action, method="q_of_action")  # pyright: ignore[reportReturnType]
+
+    collect = make_collect(env, apply_fn, input_fn, config.exploration, warmup=config.learner.warmup)
+
+    def init(key: jax.Array) -> TrainState:
+        network_key, actor_key, learner_key = jax.random.split(key, 3)
+        actors = init_actors(actor_key, env, config.train.num_envs)
+        first = actors.env_states
+        inputs = input_fn(jax.tree.map(lambda leaf: leaf[0], first.obs), first.scene.target[0])
+        # XLA's own generator compiles four times faster than threefry, forty kernels long.
+        fast_key = jax.random.wrap_key_data(jnp.tile(jax.random.key_data(network_key), 2), impl="rbg")
+        drawn = network.init(fast_key, inputs[None])["params"]
+        experience: Experience = jax.eval_shape(collect, actors, drawn)[1]
+        learning = init_learning(
+            learner_key,
+            drawn if params is None else params,
+            experience.steps,
+            config.replay,
+            optimizer,
+            max_pushes=config.task.max_pushes,
+        )
+        return TrainState(actors, learning)
+
+    learn = make_learn(
+        apply_fn=apply_fn,
+        q_at_fn=q_at_fn,
+        mask_fn=env.action_mask,
+        input_fn=input_fn,
+        optimizer=optimizer,
+        config=config.learner,
+        replay_config=config.replay,
+    )
+    if params is not None:
+        _refuse_misfit(params, network, config)
+    return Program(init, collect, learn)
+
+
+def enable_compilation_cache() -> None:
+    """Keep compiled programs in the cache folder, unless the user chose another or switched it off."""
+    if os.environ.get(CACHE_SWITCH) == "0" or jax.config.values["jax_compilation_cache_dir"]:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(io.cache_dir() / "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+
+
+def _refuse_misfit(params: Params, network: nn.Module, config: Config) -> None:
+    blank = jax.ShapeDtypeStruct((1, 100, 100, 2), np.float32)
+    expected = jax.eval_shape(network.init, jax.random.key(0), blank)["params"]
+
+    def shapes(tree: Any) -> Any:
+        return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
+
+    if shapes(params) != shapes(expected):
+        raise ValueError(
+            f"the initial parameters are of another network; this run has network.width = {config.network.width}"
+        )

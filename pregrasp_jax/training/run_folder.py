@@ -1,0 +1,184 @@
+"""The folder of a run: who may write to it, and its files beside the checkpoints.
+
+runs/NAME/: config.yaml, manifest.json, metrics.jsonl, checkpoints/, best/, run.lock.
+"""
+
+import datetime
+import fcntl
+import json
+import os
+import platform
+from pathlib import Path
+from typing import Any, TextIO
+
+import jax
+
+from pregrasp_jax import io
+from pregrasp_jax.checkpoint.policy import read_config, write_config
+from pregrasp_jax.config import Config, difference
+from pregrasp_jax.machine import versions
+
+EXTENDABLE = ("train.minutes", "train.episodes")
+"""Settings that may change when a run is resumed: they say when it stops, not what it does."""
+
+
+class RunFolder:
+    """A locked run folder; `create` or `open` one, and use it in a `with` block."""
+
+    def __init__(self, path: Path, lock: TextIO):
+        """Hold the lock; use `create` or `open`."""
+        self.path = path
+        self._lock = lock
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.path / "checkpoints"
+
+    @property
+    def best(self) -> Path:
+        """Folder of the best policy."""
+        return self.path / "best"
+
+    @classmethod
+    def create(cls, path: Path, config: Config) -> "RunFolder":
+        """Begin a run.
+
+        Raises:
+            ValueError: the folder holds something, or cannot be written.
+        """
+        refuse_used(path)
+        folder = cls(path, _locked(path))
+        write_config(path / "config.yaml", config)
+        return folder
+
+    @classmethod
+    def open(cls, path: Path, config: Config) -> "RunFolder":
+        """Continue a run.
+
+        Args:
+            path: a folder that `create` made.
+            config: its configuration, up to `EXTENDABLE`.
+
+        Raises:
+            ValueError: no run, in use by another process, or another configuration; the latter lists the difference.
+        """
+        changed = difference(stored_config(path), config)
+        if refused := [line for line in changed if line.split(":")[0] not in EXTENDABLE]:
+            raise ValueError(
+                f"run {path} cannot be resumed with a changed configuration ({'; '.join(refused)}); allowed to change: "
+                f"{', '.join(EXTENDABLE)}; --init-from starts a new run from its parameters"
+            )
+        folder = cls(path, _locked(path))
+        if changed:
+            write_config(path / "config.yaml", config)
+        return folder
+
+    def __enter__(self) -> "RunFolder":
+        """Keep the lock."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Release the lock."""
+        self._lock.close()
+
+    def begin_session(self, hashes: dict[str, str], env_steps: int) -> None:
+        """Record versions, machine and hashes, and that a process goes on from `env_steps`.
+
+        Raises:
+            ValueError: the run began with other objects or scenes.
+        """
+        file = self.path / "manifest.json"
+        manifest = json.loads(file.read_text()) if file.exists() else {"hashes": hashes, "sessions": []}
+        if manifest["hashes"] != hashes:
+            odd = [name for name in hashes if manifest["hashes"].get(name) != hashes[name]]
+            raise ValueError(
+                f"run {self.path} began with another {odd[0]} ({manifest['hashes'].get(odd[0])}, now "
+                f"{hashes[odd[0]]}); resume it with the same objects, MuJoCo and package version"
+            )
+        session = {
+            "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            "env_steps": env_steps,
+            "versions": versions(),
+            "machine": describe_machine(),
+        }
+        io.write_json(file, manifest | {"sessions": [*manifest["sessions"], session]})
+
+    def append_metrics(self, row: dict[str, Any]) -> None:
+        """Append one row to metrics.jsonl."""
+        with (self.path / "metrics.jsonl").open("a") as file:
+            file.write(json.dumps(row, allow_nan=False) + "\n")
+
+    def forget_metrics_after(self, env_steps: int) -> None:
+        """Drop the rows later than a checkpoint, which will be measured again, and a last line that was cut."""
+        file = self.path / "metrics.jsonl"
+        if file.exists():
+            kept = [line for line in file.read_text().splitlines() if _env_steps(line) <= env_steps]
+            io.write_bytes(file, "".join(f"{line}\n" for line in kept).encode())
+
+
+def refuse_used(path: Path) -> None:
+    """Refuse a folder in which no run can begin, before any work is done for it.
+
+    Raises:
+        ValueError: it holds a run, or anything else.
+    """
+    if path.exists() and not path.is_dir():
+        raise ValueError(f"run folder {path} is a file; allowed is a new or empty folder")
+    if (path / "config.yaml").exists():
+        raise ValueError(
+            f"run folder {path} already holds a run; continue it with `python train.py resume {path}`, or choose "
+            "another --run-dir"
+        )
+    if path.exists() and any(entry.name != "run.lock" for entry in path.iterdir()):
+        raise ValueError(f"run folder {path} is not empty and holds no run; allowed is a new or empty folder")
+
+
+def stored_config(path: Path) -> Config:
+    """Return the configuration of the run in a folder.
+
+    Raises:
+        ValueError: the folder holds no run, or its config.yaml is damaged.
+    """
+    if not (path / "config.yaml").is_file():
+        raise ValueError(
+            f"{path} is not a run folder (it has no config.yaml); allowed is the --run-dir of an earlier run"
+        )
+    return read_config(path / "config.yaml")
+
+
+def describe_machine() -> dict[str, Any]:
+    """Return what a measurement depends on besides versions."""
+    return {
+        "platform": platform.platform(),
+        "processor": platform.machine(),
+        "cores": os.cpu_count(),
+        "devices": [device.device_kind for device in jax.local_devices()],
+    }
+
+
+def _env_steps(line: str) -> float:
+    try:
+        return json.loads(line)["env_steps"]
+    except (json.JSONDecodeError, KeyError, TypeError):
+        return float("inf")
+
+
+def _locked(path: Path) -> TextIO:
+    """Return the open lock file of a folder; the lock ends with the process, however that ends."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        file = (path / "run.lock").open("a+")
+    except OSError as error:
+        raise ValueError(f"run folder {path} cannot be written ({error.strerror})") from None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.seek(0)
+        holder = file.read().strip() or "unknown"
+        file.close()
+        raise ValueError(f"run folder {path} is in use by process {holder}; allowed is one process at a time") from None
+    file.truncate(0)
+    file.write(f"{os.getpid()}\n")
+    file.flush()
+    return file

@@ -1,0 +1,111 @@
+"""A training session: objects, scenes, program and run folder put together, then the loop of `trainer`."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from pregrasp_jax import policies
+from pregrasp_jax.checkpoint.policy import load_policy
+from pregrasp_jax.config import Config
+from pregrasp_jax.env import Env, make_env
+from pregrasp_jax.evaluation import Evaluator
+from pregrasp_jax.heightmap import network_input
+from pregrasp_jax.learning.learner import Params
+from pregrasp_jax.learning.networks import QNetwork
+from pregrasp_jax.training import resources
+from pregrasp_jax.training.console import Console
+from pregrasp_jax.training.interrupt import Interrupt
+from pregrasp_jax.training.program import enable_compilation_cache, make_program
+from pregrasp_jax.training.run_folder import RunFolder, refuse_used
+from pregrasp_jax.training.trainer import EvaluateFn, Trainer
+
+VALIDATION_ENVS = 16
+"""Validation scenes side by side; the result does not depend on it."""
+
+
+def train(config: Config, run_dir: Path, *, init_from: Path | None = None, console: Console | None = None) -> int:
+    """Start a run.
+
+    Nothing is written before objects, scenes, initial parameters, memory and disk have been found to do.
+
+    Args:
+        config: the run.
+        run_dir: new or empty folder.
+        init_from: run or policy whose parameters are the initial ones; drawn from the seed if None.
+        console: told about progress.
+
+    Returns:
+        0 if the run is done, 1 if its last checkpoint could not be written, 128 + the signal that interrupted it.
+
+    Raises:
+        ValueError: one line says what cannot be used, and what is allowed.
+    """
+    refuse_used(run_dir)
+    params = None if init_from is None else load_policy(init_from).params
+    return _session(config, run_dir, None, params, console or Console())
+
+
+def resume(config: Config, run_dir: Path, *, console: Console | None = None) -> int:
+    """Continue a run from its newest intact checkpoint; the rest is as in `train`.
+
+    Args:
+        config: of the run; only its limits may differ (`run_folder.EXTENDABLE`).
+        run_dir: folder of the run.
+        console: told about progress.
+    """
+    folder = RunFolder.open(run_dir, config)
+    return _session(config, run_dir, folder, None, console or Console())
+
+
+def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
+    enable_compilation_cache()
+    config.validate()
+    env = _load(config, "train", console)
+    validation = _load(config, "validation", console)
+    program = make_program(env, config, params=params)
+    resources.check(*program.shapes().split(), run_dir)
+    resumed, folder = folder is not None, folder or RunFolder.create(run_dir, config)
+    trainer = Trainer(config, folder, program, make_evaluate(validation, config), console)
+    with folder, Interrupt(console.say, console.close) as interrupt:
+        (trainer.resume if resumed else trainer.begin)()
+        folder.begin_session(_hashes(env, validation), trainer.progress.env_steps)
+        try:
+            ending = trainer.run(lambda: interrupt.exit_code is not None)
+        finally:
+            console.close()
+        console.say(ending)
+        return interrupt.exit_code or (0 if trainer.saved else 1)
+
+
+def make_evaluate(env: Env, config: Config) -> EvaluateFn:
+    """Return the function that measures parameters on all scenes of `env`, grasp included; it compiles once."""
+    network = QNetwork(width=config.network.width)
+
+    def q_values(params: Params, images: jax.Array) -> jax.Array:
+        return network.apply({"params": params}, images)  # pyright: ignore[reportReturnType]
+
+    make_policy = policies.make_learned(env, q_values, network_input)
+    episodes = len(env.scenes)
+    evaluator = Evaluator(env, num_envs=min(VALIDATION_ENVS, episodes))
+
+    def evaluate(params: Params) -> dict[str, Any]:
+        return evaluator.run(make_policy(params), episodes=episodes, seed=config.seed).summary()
+
+    return evaluate
+
+
+def _load(config: Config, split: Any, console: Console) -> Env:
+    def packed(done: int, total: int) -> None:
+        if done == total or done % max(1, total // 10) == 0:
+            console.say(f"packing {split} scenes: {done} of {total}")
+
+    return make_env(config, split=split, progress=packed)
+
+
+def _hashes(env: Env, validation: Env) -> dict[str, str]:
+    return {
+        "hull bank": env.bank.content_hash,
+        "training scenes": env.scenes.content_hash,
+        "validation scenes": validation.scenes.content_hash,
+    }

@@ -1,0 +1,248 @@
+"""The training loop: collect, learn, log, evaluate, checkpoint."""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+
+from pregrasp_jax.checkpoint import restore, save, save_policy
+from pregrasp_jax.config import Config
+from pregrasp_jax.learning.learner import Params
+from pregrasp_jax.training import collect, learn
+from pregrasp_jax.training.console import Console, format_time
+from pregrasp_jax.training.program import Program, TrainState
+from pregrasp_jax.training.run_folder import RunFolder
+
+EvaluateFn = Callable[[Params], dict[str, Any]]
+"""``params -> {"success_rate": ..., ...}`` on the validation scenes."""
+
+PHASES = ("collect", "learn", "evaluate", "checkpoint")
+
+
+@dataclass
+class Progress:
+    """What the host knows of a run; saved with every checkpoint.
+
+    Attributes:
+        env_steps: pushes so far.
+        episodes: ended so far.
+        seconds: by phase, over all sessions; compilation and start-up are not training time.
+        best: success rate of the best policy so far.
+        evaluated_at: env steps of the last evaluation.
+    """
+
+    env_steps: int = 0
+    episodes: int = 0
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PHASES, 0.0))
+    best: float | None = None
+    evaluated_at: int | None = None
+
+    @property
+    def total_seconds(self) -> float:
+        """Training time."""
+        return sum(self.seconds.values())
+
+    @contextmanager
+    def timed(self, phase: str) -> Iterator[None]:
+        """Count the time of a block, as the host sees it, for a phase."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[phase] += time.perf_counter() - start
+
+    def share_done(self, config: Config) -> float:
+        """Return how much of the run is done, 0 to 1, by the limit that comes first."""
+        by_time = self.total_seconds / (60 * config.train.minutes) if config.train.minutes else 0.0
+        return min(1.0, max(by_time, self.episodes / config.train.episodes))
+
+
+class Trainer:
+    """One session of a run: from a fresh or restored state to a limit or an interruption."""
+
+    def __init__(
+        self,
+        config: Config,
+        folder: RunFolder,
+        program: Program,
+        evaluate: EvaluateFn,
+        console: Console,
+    ):
+        """Compile nothing yet.
+
+        Args:
+            config: the run.
+            folder: locked.
+            program: not compiled.
+            evaluate: measures parameters on the validation scenes.
+            console: told about progress.
+        """
+        self.config = config
+        self.folder = folder
+        self.program = program
+        self.evaluate_fn = evaluate
+        self.console = console
+        self.progress = Progress()
+        self._saved_at = -1
+        self._tried_to_save_at = 0.0
+        self._logged_at = (0, 0.0)
+
+    def begin(self) -> None:
+        """Start from the seed, and write the checkpoint of step 0."""
+        self.state = jax.jit(self.program.init)(jax.random.key(self.config.seed))
+        self.save()
+
+    def resume(self) -> None:
+        """Continue from the newest intact checkpoint.
+
+        Raises:
+            ValueError: there is none, or it does not fit the configuration.
+        """
+        template, ring = self.program.shapes().split()
+        restored = restore(self.folder.checkpoints, template, ring)
+        for problem in restored.problems:
+            self.console.say(f"warning: {problem}; going on from the checkpoint of step {restored.step}")
+        self.state = restored.tree.join(restored.ring)
+        self.progress = Progress(**restored.extra)
+        self.folder.forget_metrics_after(restored.step)
+        self._saved_at, self._tried_to_save_at = restored.step, self.progress.total_seconds
+        self._logged_at = (restored.step, self.progress.total_seconds)
+        self.console.say(f"resuming {self.folder.path} at step {restored.step}, episode {self.progress.episodes}")
+
+    def run(self, stop: Callable[[], bool]) -> str:
+        """Train until a limit is reached or `stop`, asked before every step, returns True.
+
+        Returns:
+            One line that says why it ended.
+        """
+        if self.progress.share_done(self.config) >= 1.0:
+            return "the run is complete; a higher --train.episodes or --train.minutes extends it"
+        self.console.say("compiling ...")
+        program, seconds = self.program.compile(self.state)
+        self.console.say(f"compiled in {seconds:.1f} s")
+        self.console.start()
+        while self.progress.share_done(self.config) < 1.0:
+            if stop():
+                return self._interrupted()
+            self._step(program)
+            if self._crossed(self.config.train.log_every):
+                self.log()
+            if self._crossed(self.config.train.evaluate_every):
+                self.evaluate()
+            if self.progress.total_seconds - self._tried_to_save_at >= 60 * self.config.train.checkpoint_minutes:
+                self.save()
+        self.evaluate()
+        self.save()
+        return f"done: {self.progress.episodes} episodes in {format_time(self.progress.total_seconds)}"
+
+    def _interrupted(self) -> str:
+        self.save()
+        step, path = self.progress.env_steps, self.folder.path
+        return f"interrupted at step {step}; continue with `python train.py resume {path}`"
+
+    def _step(self, program: Program) -> None:
+        """Push once in every scene and learn from it."""
+        progress, state = self.progress, self.state
+        due_before = learn.num_updates(progress.env_steps, self.config.learner)
+        progress.env_steps += self.config.train.num_envs
+        updates = learn.num_updates(progress.env_steps, self.config.learner) - due_before
+        with progress.timed("collect"):
+            actors, experience = program.collect(state.actors, state.learning.learner.params)
+            progress.episodes = int(experience.episodes)
+        with progress.timed("learn"):
+            learning = program.learn(state.learning, experience, np.int32(updates), np.float32(self._beta()))
+            jax.block_until_ready(learning.updates)
+        self.state = TrainState(actors, learning)
+
+    def _beta(self) -> float:
+        """Return the importance exponent, which rises to 1 over `train.episodes`."""
+        beta = self.config.replay.importance_exponent
+        return beta + (1.0 - beta) * min(1.0, self.progress.episodes / self.config.train.episodes)
+
+    def log(self) -> None:
+        """Append a row to metrics.jsonl, show it, and count anew.
+
+        Raises:
+            FloatingPointError: the loss is no longer finite; the last checkpoint is.
+        """
+        progress, actors, learning = self.progress, self.state.actors, self.state.learning
+        row = collect.report(actors.tally) | learn.report(learning)
+        epsilon = collect.epsilon_at(progress.env_steps, self.config.exploration, warmup=self.config.learner.warmup)
+        steps, seconds = progress.env_steps - self._logged_at[0], progress.total_seconds - self._logged_at[1]
+        row |= {"train/epsilon": float(epsilon), "time/seconds": progress.total_seconds}
+        row |= {f"time/{phase}": progress.seconds[phase] for phase in PHASES}
+        row["time/env_steps_per_second"] = steps / max(seconds, 1e-9)
+        if row["train/loss"] is not None and not math.isfinite(row["train/loss"]):
+            raise FloatingPointError(
+                f"the loss is {row['train/loss']} at step {progress.env_steps}; the last checkpoint is of step "
+                f"{self._saved_at}; a smaller learner.learning_rate may help"
+            )
+        self._write("metrics", lambda: self.folder.append_metrics(row))
+        self.state = TrainState(actors.replace(tally=actors.tally.begin_report()), learning.begin_report())
+        self._logged_at = (progress.env_steps, progress.total_seconds)
+        share = progress.share_done(self.config)
+        self.console.update(row, share=share, eta=self._seconds_left(share))
+
+    def evaluate(self) -> None:
+        """Measure the policy on the validation scenes, and keep it if it is the best (of equals, the newest)."""
+        progress = self.progress
+        if progress.evaluated_at == progress.env_steps:
+            return
+        progress.evaluated_at = progress.env_steps
+        params = self.state.learning.learner.params
+        with progress.timed("evaluate"):
+            measured = self.evaluate_fn(params)
+        where = {"env_steps": progress.env_steps, "episodes": progress.episodes}
+        row = where | {f"eval/{name}": value for name, value in measured.items()}
+        self._write("metrics", lambda: self.folder.append_metrics(row))
+        if progress.best is None or measured["success_rate"] >= progress.best:
+            progress.best = measured["success_rate"]
+            self._write("policy", lambda: save_policy(self.folder.best, params, self.config, where | measured))
+        rate = f"success {measured['success_rate']:.0%} (best {progress.best:.0%})"
+        self.console.say(f"validation at step {progress.env_steps}: {rate}")
+
+    def save(self) -> None:
+        """Write a checkpoint, unless this step has one."""
+        progress = self.progress
+        if self._saved_at == progress.env_steps:
+            return
+        rest, _ = self.state.split()
+        ring, extra = self.state.ring(), dict(vars(progress))
+        with progress.timed("checkpoint"):
+            written = self._write(
+                "checkpoint",
+                lambda: save(self.folder.checkpoints, progress.env_steps, rest, ring, extra),
+            )
+        self._tried_to_save_at = progress.total_seconds
+        if written:
+            self._saved_at = progress.env_steps
+
+    @property
+    def saved(self) -> bool:
+        """Whether the current step has a checkpoint."""
+        return self._saved_at == self.progress.env_steps
+
+    def _write(self, what: str, write: Callable[[], object]) -> bool:
+        """Write a file; a full disk is reported, and the training goes on. Return whether it was written."""
+        try:
+            write()
+        except OSError as error:
+            self.console.say(
+                f"warning: no {what} written at step {self.progress.env_steps} ({error.strerror}: {self.folder.path}); "
+                f"the last checkpoint is of step {self._saved_at}"
+            )
+            return False
+        return True
+
+    def _crossed(self, interval: int) -> bool:
+        """Return whether the last step reached a multiple of `interval` env steps (0: never)."""
+        now = self.progress.env_steps
+        return interval > 0 and now // interval > (now - self.config.train.num_envs) // interval
+
+    def _seconds_left(self, share: float) -> float | None:
+        return self.progress.total_seconds * (1 - share) / share if share > 0 else None

@@ -1,0 +1,377 @@
+"""The training loop on a world without physics: bookkeeping, determinism, resume, faults."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fake_env import FakeEnv
+
+from pregrasp_jax import grid
+from pregrasp_jax.checkpoint import checksum, load_policy
+from pregrasp_jax.config import PRESETS, Config, ExplorationConfig, from_dict, to_dict
+from pregrasp_jax.learning import learner
+from pregrasp_jax.training import collect, learn, program, resources
+from pregrasp_jax.training.console import Console, describe, format_time
+from pregrasp_jax.training.run_folder import RunFolder, stored_config
+from pregrasp_jax.training.trainer import Trainer
+from pregrasp_jax.types import MAX_OBJECTS, REASONS, EnvState, Observation, StepResult
+
+TIME = "time/"
+
+
+@dataclasses.dataclass(frozen=True)
+class PictureEnv(FakeEnv):
+    """The fake world with random resets, and pictures that say where everything is."""
+
+    bank: Any = dataclasses.field(
+        default_factory=lambda: SimpleNamespace(eligible=np.array([True, True, False]), content_hash="hulls")
+    )
+
+    def reset(self, key: jax.Array) -> EnvState:
+        return self._draw(self.reset_to(jax.random.randint(key, (), 0, len(self.scenes))))
+
+    def step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, StepResult]:
+        next_state, result = super().step(state, action)
+        return self._draw(next_state), result
+
+    def _draw(self, state: EnvState) -> EnvState:
+        points = jnp.concatenate([state.centroids, state.p1[None]])
+        row, col = grid.world_to_cell(points)
+        ids = jnp.arange(1, MAX_OBJECTS + 2).astype(jnp.uint8)
+        blank = jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8)
+        pictures = Observation(blank.at[row, col].set(100 + ids, mode="drop"), blank.at[row, col].set(ids, mode="drop"))
+        return state.replace(obs=pictures)
+
+
+def make_config(**train: Any) -> Config:
+    values = to_dict(PRESETS["ci"])
+    values["train"] |= {"num_envs": 3, "minutes": 0.0, "episodes": 12, "log_every": 6} | train
+    values["learner"] |= {"warmup": 9, "updates_per_step": 0.25, "batch_size": 2}
+    values["replay"] |= {"capacity": 70}
+    values["network"]["width"] = 1.0
+    return from_dict(values).validate()
+
+
+def input_fn(obs: Observation, target: jax.Array) -> jax.Array:
+    target_pixel = (obs.instance_ids == target + 1).astype(jnp.float32)
+    return jnp.stack([obs.height.astype(jnp.float32) / 255, target_pixel], axis=-1)
+
+
+class TinyNetwork(nn.Module):
+    """One convolution: compiles in no time."""
+
+    width: float = 1.0
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        return nn.Conv(2, (round(3 * self.width),) * 2, name="conv")(x)
+
+    def q_of_action(self, x: jax.Array, action: jax.Array) -> jax.Array:
+        return jnp.take_along_axis(self(x).reshape(x.shape[0], -1), action[:, None], axis=1)[:, 0]
+
+
+def make_program(config: Config, **options: Any) -> program.Program:
+    network = TinyNetwork(width=config.network.width)
+    return program.make_program(PictureEnv(), config, input_fn=input_fn, network=network, **options)
+
+
+def evaluate(params: Any) -> dict[str, Any]:
+    return {"success_rate": 0.25, "mean_motions": None}
+
+
+def stop_after(steps: int) -> Callable[[], bool]:
+    """Stand for a signal that comes after a number of steps."""
+    left = iter(range(steps))
+    return lambda: next(left, None) is None
+
+
+def never() -> bool:
+    return False
+
+
+def make_trainer(path: Path, config: Config, *, resume: bool = False) -> Trainer:
+    built = make_program(config)
+    folder = RunFolder.open(path, config) if resume else RunFolder.create(path, config)
+    trainer = Trainer(config, folder, built, evaluate, Console(open("/dev/null", "w")))  # noqa: SIM115
+    (trainer.resume if resume else trainer.begin)()
+    return trainer
+
+
+def run(path: Path, config: Config, *, resume: bool = False, stop: Callable[[], bool] = never) -> Trainer:
+    trainer = make_trainer(path, config, resume=resume)
+    with trainer.folder:
+        trainer.run(stop)
+    return trainer
+
+
+def rows(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+
+
+def timeless(path: Path) -> list[dict[str, Any]]:
+    return [{k: v for k, v in row.items() if not k.startswith(TIME)} for row in rows(path)]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Trainer:
+    return run(tmp_path_factory.mktemp("runs") / "whole", make_config(episodes=24))
+
+
+def test_metrics_add_up(finished):
+    log = [row for row in rows(finished.folder.path) if "train/loss" in row]
+    assert [row["env_steps"] for row in log] == list(range(6, log[-1]["env_steps"] + 1, 6))
+    ended = sum(row[f"reasons/{name}"] for row in log for name in REASONS if name != "running")
+    assert ended == log[-1]["episodes"] > 10
+    last = log[-1]
+    assert last["gradient_steps"] == int((last["env_steps"] - 9) * 0.25)
+    assert last["replay/rows"] == last["env_steps"] + last["replay/her_rows"]
+    assert 0 < last["replay/size"] <= 70
+    assert last["time/collect"] > 0 and last["time/learn"] > 0
+    assert log[0]["train/loss"] is None and last["train/loss"] > 0
+    assert log[0]["train/explored"] == 1.0, "the warm-up explores only"
+    assert last["train/epsilon"] == pytest.approx(1.0 - 0.9 * min(1.0, last["env_steps"] / 64))
+
+
+def test_a_finished_run_leaves_everything(finished):
+    path = finished.folder.path
+    assert finished.saved and finished.progress.episodes >= 24
+    assert stored_config(path) == finished.config
+    assert load_policy(path).evaluation["success_rate"] == 0.25
+    assert checksum(load_policy(path).params) == checksum(finished.state.learning.learner.params)
+    assert rows(path)[-1]["eval/success_rate"] == 0.25
+
+
+def test_same_seed_same_metrics(tmp_path, finished):
+    run(tmp_path / "again", finished.config)
+    assert timeless(tmp_path / "again") == timeless(finished.folder.path)
+    other = dataclasses.replace(finished.config, seed=1)
+    run(tmp_path / "other", other)
+    assert timeless(tmp_path / "other") != timeless(finished.folder.path)
+
+
+def test_interrupted_and_resumed_equals_uninterrupted(tmp_path, finished):
+    path = tmp_path / "halves"
+    first = run(path, finished.config, stop=stop_after(7))
+    assert first.progress.env_steps == 7 * 3 and first.saved
+    second = run(path, finished.config, resume=True)
+    assert checksum(second.state) == checksum(finished.state)
+    assert timeless(path) == timeless(finished.folder.path)
+
+
+def test_resume_repeats_what_a_crash_lost(tmp_path, finished):
+    """A crash after the checkpoint: its metrics rows are measured again, and a cut last line goes."""
+    path = tmp_path / "crashed"
+    trainer = make_trainer(path, finished.config)
+    with trainer.folder:
+        trainer.run(stop_after(4))
+        trainer._saved_at = trainer.progress.env_steps + 3  # what follows is not saved
+        trainer.run(stop_after(1))
+    with (path / "metrics.jsonl").open("a") as file:
+        file.write('{"env_steps": 15, "cut')
+    second = run(path, finished.config, resume=True)
+    assert checksum(second.state) == checksum(finished.state)
+    assert timeless(path) == timeless(finished.folder.path)
+
+
+def test_a_run_can_be_extended_but_not_changed(tmp_path):
+    path, config = tmp_path / "run", make_config(episodes=6)
+    first = run(path, config)
+    longer = dataclasses.replace(config, train=dataclasses.replace(config.train, episodes=14))
+    assert run(path, longer, resume=True).progress.episodes >= 14 > first.progress.episodes
+    assert stored_config(path) == longer
+    changed = dataclasses.replace(longer, exploration=ExplorationConfig(guided=False))
+    with pytest.raises(ValueError, match=r"exploration.guided: True -> False.*allowed to change: train.minutes"):
+        RunFolder.open(path, changed)
+    with pytest.raises(ValueError, match="already holds a run; continue it with"):
+        RunFolder.create(path, longer)
+
+
+def test_a_complete_run_says_so(tmp_path, finished):
+    trainer = make_trainer(finished.folder.path, finished.config, resume=True)
+    with trainer.folder:
+        assert "is complete" in trainer.run(never)
+
+
+def test_a_folder_is_used_by_one_process(tmp_path):
+    config = make_config()
+    with (
+        RunFolder.create(tmp_path / "run", config),
+        pytest.raises(ValueError, match=r"in use by process \d+; allowed is one process at a time"),
+    ):
+        RunFolder.open(tmp_path / "run", config)
+    RunFolder.open(tmp_path / "run", config)
+
+
+def test_folder_refusals(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="is a file"):
+        RunFolder.create(tmp_path / "file", make_config())
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("")
+    with pytest.raises(ValueError, match="is not empty and holds no run"):
+        RunFolder.create(tmp_path / "full", make_config())
+    with pytest.raises(ValueError, match="is not a run folder"):
+        RunFolder.open(tmp_path / "full", make_config())
+    with RunFolder.create(tmp_path / "run", make_config()) as folder:
+        folder.begin_session({"hull bank": "a", "training scenes": "b"}, 0)
+        with pytest.raises(ValueError, match=r"another training scenes \(b, now c\)"):
+            folder.begin_session({"hull bank": "a", "training scenes": "c"}, 5)
+
+
+def test_a_full_disk_is_reported_and_survived(tmp_path, monkeypatch):
+    said: list[str] = []
+    trainer = make_trainer(tmp_path / "run", make_config(episodes=5))
+    monkeypatch.setattr(trainer.console, "say", said.append)
+
+    def full(*args: object, **kwargs: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pregrasp_jax.training.trainer.save", full)
+    with trainer.folder:
+        trainer.run(never)
+    assert not trainer.saved
+    assert any("no checkpoint written" in line and "last checkpoint is of step 0" in line for line in said)
+
+
+def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
+    trainer = make_trainer(tmp_path / "run", make_config(episodes=50))
+    params = trainer.state.learning.learner.params
+    poisoned = jax.tree.map(lambda leaf: leaf * jnp.nan, params)
+    state = trainer.state.learning.learner.replace(params=poisoned)
+    trainer.state = trainer.state.replace(learning=trainer.state.learning.replace(learner=state))
+    with trainer.folder, pytest.raises(FloatingPointError, match="the last checkpoint is of step 0"):
+        trainer.run(never)
+
+
+def test_parameters_of_another_network_are_refused():
+    config = make_config()
+    params = make_program(config).shapes().learning.learner.params
+    wider = dataclasses.replace(config, network=dataclasses.replace(config.network, width=2.0))
+    make_program(config, params=params)
+    with pytest.raises(ValueError, match=r"network.width = 2.0"):
+        make_program(wider, params=params)
+
+
+def test_initial_parameters_are_used(tmp_path):
+    config = make_config()
+    params = make_program(config).init(jax.random.key(77))
+    params = params.learning.learner.params
+    built = make_program(config, params=params)
+    started = built.init(jax.random.key(0)).learning.learner
+    assert checksum(started.params) == checksum(started.target_params) == checksum(params)
+
+
+def test_updates_due_add_up_over_fractions():
+    config = dataclasses.replace(PRESETS["ci"].learner, warmup=10, updates_per_step=0.3)
+    assert [learn.num_updates(steps, config) for steps in (0, 10, 13, 14, 17, 20, 110)] == [0, 0, 0, 1, 2, 3, 30]
+
+
+def test_tally_keeps_the_reasons_of_the_last_episodes():
+    window = 4
+    tally = collect.Tally(
+        env_steps=jnp.int32(0),
+        episodes=jnp.int32(0),
+        recent=jnp.full(window, -1, jnp.int8),
+        pushes=jnp.int32(0),
+        reward=jnp.float32(0),
+        explored=jnp.int32(0),
+        reasons=jnp.zeros(len(REASONS), jnp.int32),
+    )
+    success, truncated = REASONS.index("target_in_region"), REASONS.index("truncated")
+    pushes = [([success, 0, truncated], [1, 0, 1]), ([0, success, success], [0, 1, 1]), ([truncated, 0, 0], [1, 0, 0])]
+    for reason, ended in pushes:
+        results: Any = SimpleNamespace(reason=jnp.array(reason), reward=jnp.ones(3))
+        tally = collect._count(tally, results, jnp.array(ended, bool), jnp.array([True, False, False]))
+    report = collect.report(tally)
+    assert report["train/success_rate"] == 0.5, "the first success has left the window of four"
+    assert (report["episodes"], report["env_steps"]) == (5, 9)
+    assert (report["reasons/target_in_region"], report["reasons/truncated"]) == (3, 2)
+    assert report["train/explored"] == pytest.approx(1 / 3) and report["train/episode_length"] == pytest.approx(9 / 5)
+    fresh = collect.report(tally.begin_report())
+    assert fresh["train/success_rate"] == 0.5 and fresh["train/reward"] is None and fresh["episodes"] == 5
+
+
+def test_a_scene_that_ended_starts_anew_and_the_others_go_on():
+    config = make_config()
+    env = PictureEnv()
+    built = make_program(config)
+    actors = built.init(jax.random.key(3)).actors
+    params = built.shapes().learning.learner.params
+    collect_fn, params = jax.jit(built.collect), jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), params)
+    for _ in range(12):
+        before = actors
+        actors, experience = collect_fn(actors, params)
+        steps = experience.steps
+        ended = np.asarray(steps.terminated | steps.truncated)
+        pushed, _ = jax.vmap(env.step)(before.env_states, steps.action)
+        np.testing.assert_array_equal(steps.obs.height, before.env_states.obs.height)
+        np.testing.assert_array_equal(steps.next_obs.height, pushed.obs.height)
+        now = np.asarray(actors.env_states.num_pushes)
+        np.testing.assert_array_equal(now, np.where(ended, 0, np.asarray(pushed.num_pushes)))
+        eligible = np.isin(np.asarray(before.env_states.scene.object_ids), [0, 1])
+        np.testing.assert_array_equal(experience.eligible, eligible)
+
+
+def test_the_learner_measures_what_the_report_prints(monkeypatch):
+    measured: set[str] = set()
+    original = learner.update
+
+    def spy(*args: Any, **kwargs: Any) -> Any:
+        result = original(*args, **kwargs)
+        measured.update(result[2])
+        return result
+
+    monkeypatch.setattr(learner, "update", spy)
+    built = make_program(make_config())
+    shapes = built.shapes()
+    experience = jax.eval_shape(built.collect, shapes.actors, shapes.learning.learner.params)[1]
+    jax.eval_shape(built.learn, shapes.learning, experience, jnp.int32(1), jnp.float32(0))
+    assert measured == set(learn.METRICS)
+
+
+def test_too_little_memory_or_disk_is_refused_before_the_start(tmp_path, monkeypatch):
+    rest, ring = make_program(make_config()).shapes().split()
+    assert resources.num_bytes(ring) == 70 * 2 * 100 * 100
+    resources.check(rest, ring, tmp_path / "new" / "run")
+    assert not (tmp_path / "new").exists()
+    monkeypatch.setattr(resources, "available_memory", lambda: 10**6)
+    with pytest.raises(ValueError, match=r"needs about 0.5\d GB of memory, 0.00 GB are free; a smaller replay.capac"):
+        resources.check(rest, ring, tmp_path)
+    monkeypatch.setattr(resources, "available_memory", lambda: None)
+    monkeypatch.setattr(resources, "available_disk", lambda path: 10**5)
+    with pytest.raises(ValueError, match=r"GB of disk at .*0.00 GB are free"):
+        resources.check(rest, ring, tmp_path)
+
+
+def test_memory_is_read_from_machine_and_control_group(tmp_path, monkeypatch):
+    monkeypatch.setattr(resources, "_MEMINFO", tmp_path / "meminfo")
+    monkeypatch.setattr(resources, "_CGROUP", tmp_path)
+    assert resources.available_memory() is None
+    (tmp_path / "meminfo").write_text("MemTotal: 900 kB\nMemAvailable:   500 kB\nHugePages_Total:   0\n")
+    (tmp_path / "memory.max").write_text("max\n")
+    (tmp_path / "memory.current").write_text("100\n")
+    assert resources.available_memory() == 500 * 1024
+    (tmp_path / "memory.max").write_text("1000\n")
+    assert resources.available_memory() == 900
+
+
+def test_the_console_line():
+    row = {
+        "env_steps": 3200,
+        "episodes": 991,
+        "train/success_rate": 0.315,
+        "train/epsilon": 0.5,
+        "train/loss": None,
+        "time/env_steps_per_second": 12.34,
+    }
+    line = "step 3200 | episode 991 | success 32 % | epsilon 0.50 | loss ? | 12.3 steps/s | left 1:01:01"
+    assert describe(row, 3661.2) == line
+    assert format_time(None) == "?"
