@@ -14,7 +14,7 @@ from pregrasp_jax.geometry import quat_to_matrix
 from pregrasp_jax.robot import description
 
 _WRIST_SINGULAR = 1e-5
-"""sin(q5) below which joints 4 and 6 are parallel: q6 is set to 0 and q4 carries the whole turn."""
+"""sin(q5) below which joints 4 and 6 are parallel: only the sum of their turns matters."""
 _REACH_TOLERANCE = 1e-6
 """How far a cosine may exceed 1 by float32 rounding and still count as within reach."""
 
@@ -89,8 +89,9 @@ def _solve_branch(base_from_flange: jax.Array, signs: jax.Array) -> jax.Array:
     nx, ny, nz = jnp.dot(normal, x6), jnp.dot(normal, y6), jnp.dot(normal, z6)
     sine5 = jnp.sqrt(nx**2 + ny**2)
     q5 = jnp.atan2(wrist * sine5, nz)
+    free = _free_wrist_turn(base_from_flange, c1 * p5[0] + s1 * p5[1], p5[2] - d[0], jnp.stack([c1, s1]))
     singular = sine5 < _WRIST_SINGULAR
-    q6 = jnp.where(singular, 0.0, jnp.atan2(-wrist * ny, wrist * jnp.where(singular, 1.0, nx)))
+    q6 = jnp.where(singular, free, jnp.atan2(-wrist * ny, wrist * jnp.where(singular, 1.0, nx)))
     c6, s6 = jnp.cos(q6), jnp.sin(q6)
     x4 = jnp.cos(q5) * (c6 * x6 - s6 * y6) - jnp.sin(q5) * z6
     p4 = p5 + d[4] * (s6 * x6 + c6 * y6)
@@ -104,6 +105,18 @@ def _solve_branch(base_from_flange: jax.Array, signs: jax.Array) -> jax.Array:
 
     exists = (reach >= 0) & (jnp.abs(c3) <= 1 + _REACH_TOLERANCE)
     return jnp.where(exists, _wrap(jnp.stack([q1, q2, q3, q4, q5, q6])), jnp.nan)
+
+
+def _free_wrist_turn(base_from_flange: jax.Array, u: jax.Array, v: jax.Array, heading: jax.Array) -> jax.Array:
+    """Choose q6 where it is free: wrist 1 goes toward the shoulder if frame 5 is far from it, away if it is near.
+
+    That reaches every pose which some choice reaches. (u, v) is frame 5 seen from the shoulder in the arm's plane,
+    `heading` [2] the plane's direction.
+    """
+    a, *_ = _constants()
+    sign = jnp.where(jnp.hypot(u, v) >= np.abs(a[1]), 1.0, -1.0)
+    outward = sign * jnp.stack([u * heading[0], u * heading[1], v])
+    return jnp.atan2(-jnp.dot(outward, base_from_flange[:3, 0]), -jnp.dot(outward, base_from_flange[:3, 1]))
 
 
 def _wrap(angle: jax.Array) -> jax.Array:
