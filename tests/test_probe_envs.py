@@ -87,7 +87,8 @@ add, add_hindsight = jax.jit(replay.add), jax.jit(hindsight.add_hindsight)
 def train(memory, params, key, *, num_updates, batch_size=16, priority_exponent=0.6, polyak=0.9):
     def one(carry, k):
         state, memory, metrics = learner.learn(
-            *carry,
+            carry[0],
+            carry[1],
             k,
             batch_size=batch_size,
             input_fn=network_input,

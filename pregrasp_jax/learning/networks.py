@@ -254,6 +254,25 @@ def _pad(x: jax.Array) -> jax.Array:
     return jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
 
 
+def q_functions(
+    network: QNetwork,
+) -> tuple[Callable[[Any, jax.Array], jax.Array], Callable[[Any, jax.Array, jax.Array], jax.Array]]:
+    """Return what `learner.update` calls `apply_fn` and `q_at_fn`.
+
+    Returns:
+        ``(params, x [B, H, W, 2]) -> [B, H, W, 2]``, all pushes, and ``(params, x, action [B]) -> [B]``, the taken
+        ones.
+    """
+
+    def apply_fn(params: Any, x: jax.Array) -> jax.Array:
+        return jnp.asarray(network.apply(params, x))
+
+    def q_at_fn(params: Any, x: jax.Array, action: jax.Array) -> jax.Array:
+        return jnp.asarray(network.apply(params, x, action, method="q_of_action"))
+
+    return apply_fn, q_at_fn
+
+
 def num_parameters(params: Any) -> int:
     """Return the number of scalars in a pytree of parameters."""
     return sum(leaf.size for leaf in jax.tree.leaves(params))
