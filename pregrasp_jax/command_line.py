@@ -1,0 +1,59 @@
+"""Errors of a command line in one line, exit code 2, no traceback."""
+
+import contextlib
+import io as text_io
+import re
+import sys
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+T = TypeVar("T")
+
+USAGE_ERROR = 2
+"""Exit code of a command that was asked for something impossible."""
+
+
+def parse(parser: Callable[[], T]) -> T:
+    """Return what a tyro parser returns; its boxed error message becomes one line.
+
+    Raises:
+        SystemExit: the arguments are wrong (2), or help was asked for (0).
+    """
+    complaint = text_io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return parser()
+    except SystemExit as error:
+        if error.code:
+            print(f"error: {unbox(complaint.getvalue())}", file=sys.stderr)
+        raise
+
+
+def unbox(text: str) -> str:
+    """Return what a tyro error box says, without its frame, suggestions of other commands and help."""
+    lines = [line.strip().strip("│╭╮╰╯─ ").strip() for line in text.splitlines()]
+    sections = [section for section in _split(lines) if section]
+    message = " ".join(sections[0]) if sections else "the arguments cannot be read"
+    offers = [line for section in sections[1:] for line in section if re.match(r"--[a-z]|Available", line)]
+    return f"{message} ({offers[0]})" if offers and "nrecognized" in message else message
+
+
+@contextlib.contextmanager
+def one_line_errors() -> Iterator[None]:
+    """Turn a refusal (ValueError, FileNotFoundError, ...) into one line on standard error and exit code 2."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(USAGE_ERROR)
+
+
+def _split(lines: list[str]) -> list[list[str]]:
+    """Return the sections of a box: its title and rules have no text left once the frame is stripped."""
+    sections: list[list[str]] = [[]]
+    for line in lines[1:]:
+        if line:
+            sections[-1].append(line)
+        else:
+            sections.append([])
+    return sections
