@@ -38,9 +38,9 @@ def test_options_and_contact_settings_are_those_measured():
     assert mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     assert mj_model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert mj_model.opt.ls_iterations == mujoco.MjOption().ls_iterations
-    table = load_table = robot.load_table_spec().compile()
+    table = robot.load_table_spec().compile()
     for name in ("timestep", "impratio", "iterations", "cone", "integrator"):
-        assert getattr(load_table.opt, name) == getattr(mj_model.opt, name)
+        assert getattr(table.opt, name) == getattr(mj_model.opt, name)
     assert table.nbody == 1 and table.geom("table").friction[0] == 0.1
     np.testing.assert_allclose(robot.feed_forward(mj_model), [0.1, 0.1, 0.1, 0.05, 0.05, 0.05, 0])
     moving = mj_model.body_rootid == mj_model.body("base").id
@@ -89,6 +89,7 @@ def test_home_is_the_start_pose_open_and_at_rest(data):
 def test_the_aperture_follows_the_makers_formula_and_changes_within_half_a_second(data):
     mj_model = description.robot_model()
     pads = [mj_model.geom(f"hand_{side}_pad").id for side in ("left", "right")]
+    gap = np.nan
     for angle in (0.0, 0.3, 0.9, 1.223):
         pose_robot(data, np.append(robot.home_joint_pos()[:6], [angle, angle]))
         gap = abs(np.diff(data.geom_xpos[pads, 1]))[0] - 2 * mj_model.geom_size[pads[0], 1]
@@ -139,7 +140,9 @@ def test_no_posture_of_the_start_branch_lets_the_arm_touch_itself_or_the_table(d
         for a, b in pairs:
             ids = mj_model.geom(a).id, mj_model.geom(b).id
             assert mujoco.mj_geomDistance(mj_model, data, *ids, 0.01, None) > 0.002, (a, b)
-    assert np.asarray(jax.jit(jax.vmap(clearance.link_clearance))(solutions[:, branch])).min() > clearance.CLEARANCE_MARGIN
+    assert (
+        np.asarray(jax.jit(jax.vmap(clearance.link_clearance))(solutions[:, branch])).min() > clearance.CLEARANCE_MARGIN
+    )
 
 
 # -- Links
