@@ -5,6 +5,7 @@ from pregrasp_jax.evaluation.results import (
     EvaluationResult,
     evaluation_document,
     format_evaluation,
+    format_evaluations,
     load_evaluation,
 )
 from pregrasp_jax.evaluation.runner import Evaluator, Progress, evaluate_policy
@@ -17,5 +18,6 @@ __all__ = [
     "evaluate_policy",
     "evaluation_document",
     "format_evaluation",
+    "format_evaluations",
     "load_evaluation",
 ]

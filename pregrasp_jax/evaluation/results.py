@@ -183,3 +183,27 @@ def _spread(mean: float | None, std: float | None) -> str:
 
 def _maybe(value: float | None, template: str) -> str:
     return "no motion" if value is None else template.format(value)
+
+
+def format_evaluations(documents: list[dict[str, Any]]) -> str:
+    """Return a table of several evaluations, one line each."""
+    header = ("policy", "scenes", "success", "95 % interval", "in region", "motions", "most frequent failure")
+    rows = [header, *(_row(document) for document in documents)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(header))]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    )
+
+
+def _row(document: dict[str, Any]) -> tuple[str, ...]:
+    low, high = document["success_ci95"]
+    mean, std = document["mean_motions"], document["std_motions"]
+    return (
+        document["policy"],
+        f"{document['episodes']} {document['object_set']}",
+        f"{document['success_rate']:.1%}",
+        f"{low:.0%} to {high:.0%}",
+        f"{document['in_region_rate']:.1%}",
+        "none" if mean is None else f"{mean:.2f} +- {std:.2f}",
+        next((f"{reason} {count}" for reason, count in document["failures"].items()), "none"),
+    )

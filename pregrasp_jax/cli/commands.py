@@ -1,0 +1,157 @@
+"""The subcommands of `python -m pregrasp_jax`; their docstrings are the help."""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pregrasp_jax import io
+from pregrasp_jax.assets.catalogue import builtin_bank
+from pregrasp_jax.assets.meshes import Refusal, load_object_dir
+from pregrasp_jax.assets.sets import format_table
+from pregrasp_jax.cli import doctor as machine_doctor
+from pregrasp_jax.cli.evaluate import refuse_unwritable
+from pregrasp_jax.cli.film import draw_decision, draw_scenes
+from pregrasp_jax.cli.player import EvaluationConfig, make_player
+from pregrasp_jax.config import AssetsConfig, Config, ObjectSet, SceneConfig
+from pregrasp_jax.drawing import contact_sheet, save_png
+from pregrasp_jax.env import make_env
+from pregrasp_jax.evaluation import load_evaluation
+from pregrasp_jax.scene.bank import SceneBank
+from pregrasp_jax.statistics import compare as compare_evaluations
+from pregrasp_jax.statistics import format_comparison
+from pregrasp_jax.types import HullBank
+
+_SHOWN_SCENES = 12
+"""Scenes on the sheet of `scenes --png`."""
+
+
+def assets(
+    object_dir: Path | None = None, /, *, object_set: ObjectSet | None = None, png: Path = Path("assets.png")
+) -> None:
+    """List the objects of a mesh folder (or the built-in ones): hulls, size, mass, whether they can be targets.
+
+    Args:
+        object_dir: folder of .obj/.stl/.ply/.glb meshes, with subfolders seen and unseen or without; the built-in
+            catalogue if left out.
+        object_set: only this set; all that there are if left out.
+        png: contact sheet of the objects; with two sets their names are added to that of the file.
+    """
+    refuse_unwritable(png)
+    names: Sequence[ObjectSet] = (object_set,) if object_set else _object_sets(object_dir)
+    for name in names:
+        bank, refusals = _load_objects(object_dir, name)
+        file = png if len(names) == 1 else png.with_stem(f"{png.stem}-{name}")
+        print(f"{name} ({object_dir or 'built in'})\n{format_table(bank, refusals)}")
+        if bank.names:
+            _write_png(file, contact_sheet(bank))
+
+
+def compare(a: Path, b: Path, /, *, json: Path | None = None) -> None:
+    """Compare two evaluations on the same scenes: intervals, and McNemar's exact test of their difference.
+
+    Args:
+        a: file written by `evaluate.py --json`.
+        b: another, of the same scenes.
+        json: write the comparison here.
+    """
+    refuse_unwritable(json)
+    comparison = compare_evaluations(load_evaluation(a), load_evaluation(b))
+    print(format_comparison(comparison))
+    if json:
+        io.write_json(json, comparison.to_dict())
+
+
+def doctor() -> None:
+    """Say what this machine offers: versions, engines, threads, cache, free memory and disk."""
+    print(machine_doctor.format_description(machine_doctor.describe()))
+
+
+def scenes(
+    *,
+    split: Literal["train", "validation", "test"] = "test",
+    object_dir: str | None = None,
+    object_set: ObjectSet = "seen",
+    scene: SceneConfig = SceneConfig(),  # noqa: B008  (frozen)
+    png: Path | None = None,
+) -> None:
+    """Describe a bank of packed scenes; it is packed if it does not exist yet.
+
+    Args:
+        split: which bank.
+        object_dir: folder of meshes; the built-in catalogue if left out.
+        object_set: objects used in training, or kept for evaluation.
+        scene: how many scenes, how crowded.
+        png: draw the first scenes here.
+    """
+    refuse_unwritable(png)
+    config = Config(assets=AssetsConfig(object_dir=object_dir, object_set=object_set), scene=scene).validate()
+    env = make_env(config, split=split)
+    print(describe_scenes(env.scenes, env.bank))
+    if png:
+        _write_png(png, draw_scenes(env, range(min(_SHOWN_SCENES, len(env.scenes)))))
+
+
+def show(
+    *,
+    policy: str = "straight",
+    scene: int = 0,
+    pushes: int = 0,
+    object_dir: str | None = None,
+    object_set: ObjectSet = "seen",
+    camera: Literal["orthographic", "pinhole"] | None = None,
+    png: Path = Path("scene.png"),
+) -> None:
+    """Draw one decision: camera view, heightmaps, Q maps of a learned policy, and the push it chooses.
+
+    Args:
+        policy: who decides; a name or run folder as in `evaluate.py`.
+        scene: test scene.
+        pushes: let the policy push so often before the picture is taken.
+        object_dir: folder of meshes; the built-in catalogue if left out.
+        object_set: objects used in training, or kept for evaluation.
+        camera: what the policy sees through.
+        png: the picture.
+    """
+    refuse_unwritable(png)
+    assets_config = AssetsConfig(object_dir=object_dir, object_set=object_set)
+    player = make_player(EvaluationConfig(policy=policy, assets=assets_config, camera=camera))
+    if not 0 <= scene < len(player.env.scenes):
+        raise ValueError(f"scene = {scene} is out of range; allowed is 0 to {len(player.env.scenes) - 1}")
+    _write_png(png, draw_decision(player, scene=scene, pushes=pushes))
+
+
+def describe_scenes(scenes: SceneBank, bank: HullBank) -> str:
+    """Return what a scene bank holds: size, acceptance, crowding, and how often each object stands or is wanted."""
+    ids = np.asarray(scenes.object_ids)
+    crowding = Counter(int(count) for count in (ids >= 0).sum(axis=1))
+    wanted = Counter(int(i) for i in ids[np.arange(len(ids)), np.asarray(scenes.target)])
+    present = Counter(int(i) for i in ids[ids >= 0])
+    width = max(len(name) for name in ("object", *bank.names))
+    return "\n".join(
+        [
+            f"{len(scenes)} {scenes.split} scenes, {len(scenes) / scenes.tries:.0%} of {scenes.tries} tries, "
+            f"hash {scenes.content_hash}",
+            "objects per scene: " + ", ".join(f"{count}: {crowding[count]}" for count in sorted(crowding)),
+            f"{'object':<{width}}  scenes  target",
+            *(f"{name:<{width}}  {present[i]:6d}  {wanted[i]:6d}" for i, name in enumerate(bank.names)),
+        ]
+    )
+
+
+def _object_sets(object_dir: Path | None) -> list[ObjectSet]:
+    """Return the sets a folder has; a flat folder is the seen set."""
+    both: list[ObjectSet] = ["seen", "unseen"]
+    return both if object_dir is None else [name for name in both if (object_dir / name).is_dir()] or ["seen"]
+
+
+def _load_objects(object_dir: Path | None, object_set: ObjectSet) -> tuple[HullBank, list[Refusal]]:
+    return (builtin_bank(object_set), []) if object_dir is None else load_object_dir(object_dir, object_set)
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    """Write an image and say so."""
+    save_png(path, image)
+    print(f"wrote {path}")

@@ -1,0 +1,173 @@
+"""What `evaluate.py` does: find the policy, make the environment it belongs to, run it, describe the result."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from pregrasp_jax import policies
+from pregrasp_jax.checkpoint import load_policy
+from pregrasp_jax.config import AssetsConfig, Camera, Config, PhysicsConfig, SceneConfig
+from pregrasp_jax.env import Env, make_env, with_task
+from pregrasp_jax.evaluation import Evaluator, Progress, evaluation_document
+from pregrasp_jax.heightmap import network_input
+from pregrasp_jax.learning.networks import QNetwork
+from pregrasp_jax.policies import Policy
+from pregrasp_jax.training.program import enable_compilation_cache
+
+PRETRAINED = Path(__file__).parent.parent / "pretrained"
+"""The policy that ships with the package."""
+
+NUM_ENVS = 16
+"""Scenes side by side, enough to keep the engine's threads busy."""
+
+LOOKAHEAD_NUM_ENVS = 4
+"""The same for `lookahead`, each of whose decisions simulates `policies.LOOKAHEAD_CANDIDATES` scenes."""
+
+_PACKING = 50
+"""Scenes between two lines that say how many are packed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig:
+    """One evaluation.
+
+    Attributes:
+        policy: name of a script, `pretrained`, or a folder that `checkpoint.load_policy` reads.
+        assets: objects.
+        scene: test scenes; the defaults are the scenes that published results refer to.
+        physics: engine.
+        camera: None takes the one the policy was trained with (`orthographic` for scripts).
+        r_out: m, outer radius of the half ring; None takes the one the policy was trained with.
+        episodes: test scenes to run, from the first.
+        seed: of the policy's own randomness.
+        num_envs: scenes side by side; 0 chooses. Results do not depend on it.
+    """
+
+    policy: str
+    assets: AssetsConfig = field(default_factory=AssetsConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    camera: Camera | None = None
+    r_out: float | None = None
+    episodes: int = 100
+    seed: int = 0
+    num_envs: int = 0
+
+
+@dataclass(frozen=True)
+class Player:
+    """A policy with the environment that it plays in.
+
+    Attributes:
+        policy: who decides.
+        q_values: EnvState -> Q [H, W, 2] of a learned policy, None of a script.
+        env: the test environment.
+        config: what the environment was made from.
+    """
+
+    policy: Policy
+    q_values: Callable[[Any], jax.Array] | None
+    env: Env
+    config: Config
+
+
+def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print) -> Player:
+    """Load the policy and make its environment.
+
+    A learned policy keeps the task it was trained for (radii, horizon, speed); objects, scenes and physics come
+    from the request, so that every policy meets the same scenes.
+
+    Args:
+        request: what is to be evaluated.
+        say: told about slow steps.
+
+    Raises:
+        ValueError: there is no such policy, or something of the request is out of range.
+    """
+    trained = _load(request.policy)
+    config = _environment_config(request, Config() if trained is None else trained.config)
+
+    def packed(done: int, total: int) -> None:
+        if done == total or done % _PACKING < 16:
+            say(f"packing test scenes: {done} of {total}")
+
+    env = make_env(config, split="test", progress=packed)
+    if trained is None:
+        return Player(_make_script(request.policy, env, config), None, env, config)
+    network = QNetwork(width=config.network.width)
+
+    def q_values(params: Any, images: jax.Array) -> jax.Array:
+        return network.apply({"params": params}, images)  # pyright: ignore[reportReturnType]
+
+    return Player(
+        policies.make_learned(env, q_values, network_input)(trained.params),
+        lambda state: q_values(trained.params, network_input(state.obs, state.scene.target)),
+        env,
+        config,
+    )
+
+
+def run_evaluation(request: EvaluationConfig, player: Player, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Run the episodes and return the evaluation document (see `evaluation.evaluation_document`)."""
+    enable_compilation_cache()
+    start = time.monotonic()
+    default = LOOKAHEAD_NUM_ENVS if request.policy == "lookahead" else NUM_ENVS
+    evaluator = Evaluator(player.env, num_envs=request.num_envs or default)
+    result = evaluator.run(player.policy, episodes=request.episodes, seed=request.seed, progress=progress)
+    return evaluation_document(
+        result,
+        policy=request.policy,
+        config=player.config,
+        seed=request.seed,
+        hull_bank_hash=player.env.bank.content_hash,
+        scene_bank_hash=player.env.scenes.content_hash,
+        wall_seconds=time.monotonic() - start,
+    )
+
+
+def _load(spec: str) -> Any:
+    """Return the trained policy that `spec` names, None for a script."""
+    if spec in policies.SCRIPTS:
+        return None
+    if spec == "pretrained":
+        if not PRETRAINED.is_dir():
+            raise ValueError("policy pretrained: this version of the package ships no trained policy")
+        return load_policy(PRETRAINED)
+    if not Path(spec).exists():
+        names = ", ".join([*policies.SCRIPTS, "pretrained"])
+        raise ValueError(f"policy {spec} does not exist; allowed: {names}, or a run folder of train.py")
+    return load_policy(spec)
+
+
+def _environment_config(request: EvaluationConfig, trained: Config) -> Config:
+    """Return the configuration of the policy with everything replaced that the request decides."""
+    if request.num_envs < 0:
+        raise ValueError(f"num_envs = {request.num_envs} is out of range; allowed is 1 and more, or 0 to let it choose")
+    if request.episodes < 1:
+        raise ValueError(f"episodes = {request.episodes} is out of range; allowed is 1 and more")
+    test_scenes = max(request.scene.test_scenes, request.episodes)
+    config = dataclasses.replace(
+        trained,
+        seed=request.seed,
+        assets=request.assets,
+        scene=dataclasses.replace(request.scene, test_scenes=test_scenes),
+        physics=request.physics,
+        task=dataclasses.replace(
+            trained.task,
+            camera=request.camera or trained.task.camera,
+            r_out=trained.task.r_out if request.r_out is None else request.r_out,
+        ),
+    )
+    return config.validate()
+
+
+def _make_script(name: str, env: Env, config: Config) -> Policy:
+    """Return a script; `lookahead` gets an engine of its own, and no camera, which it would render for nothing."""
+    if name == "lookahead":
+        env = with_task(make_env(config, split="test"), camera="orthographic")
+    return policies.SCRIPTS[name](env)

@@ -1,0 +1,279 @@
+"""Command lines: what they accept, print, write and refuse."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+import trimesh
+from fake_env import fake_env
+from PIL import Image
+
+from pregrasp_jax import __main__ as main_module
+from pregrasp_jax.checkpoint import save_policy
+from pregrasp_jax.cli import commands, doctor, player, progress
+from pregrasp_jax.cli.evaluate import refuse_unwritable
+from pregrasp_jax.cli.player import EvaluationConfig, make_player, run_evaluation
+from pregrasp_jax.config import PRESETS, AssetsConfig, Config, PhysicsConfig, SceneConfig, TaskConfig
+from pregrasp_jax.learning.networks import QNetwork
+from pregrasp_jax.scene.bank import SceneBank
+
+ROOT = Path(__file__).parent.parent
+
+
+def _evaluate_script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("evaluate_script", ROOT / "evaluate.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["evaluate_script"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+EVALUATE = _evaluate_script()
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Return a function (main, arguments) -> exit code, standard output, standard error."""
+
+    def call(main: Any, *arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["program", *arguments])
+        code = 0
+        try:
+            main()
+        except SystemExit as error:
+            code = int(error.code or 0)
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+@pytest.fixture
+def requests(monkeypatch: pytest.MonkeyPatch) -> list[tuple[EvaluationConfig, dict]]:
+    """Collect what `evaluate.py` asks for, instead of doing it."""
+    calls: list[tuple[EvaluationConfig, dict]] = []
+    monkeypatch.setattr(EVALUATE, "evaluate", lambda request, **files: calls.append((request, files)))
+    return calls
+
+
+def test_evaluate_py_understands_the_documented_line(run: Any, requests: list) -> None:
+    code, _, _ = run(
+        EVALUATE.main,
+        *("--policy", "straight", "--object-set", "unseen", "--assets.object-dir", "meshes", "--camera", "pinhole"),
+        *("--physics.engine", "native", "--episodes", "30", "--seed", "4", "--json", "a.json", "--video", "v.gif"),
+    )
+    assert code == 0
+    request, files = requests[0]
+    assert request == EvaluationConfig(
+        policy="straight",
+        assets=AssetsConfig(object_dir="meshes", object_set="unseen"),
+        camera="pinhole",
+        physics=PhysicsConfig(engine="native"),
+        episodes=30,
+        seed=4,
+    )
+    assert files == {"json_file": Path("a.json"), "video": Path("v.gif"), "video_episodes": 3}
+
+
+def test_evaluate_py_has_a_short_spelling_and_defaults(run: Any, requests: list) -> None:
+    run(EVALUATE.main, "--policy", "runs/a", "--object-dir", "meshes", "--scene.test-scenes", "7")
+    request, files = requests[0]
+    assert request.assets == AssetsConfig(object_dir="meshes") and request.scene.test_scenes == 7
+    assert (request.episodes, request.camera, request.r_out) == (100, None, None)
+    assert files["json_file"] is None
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["--policy", "clear", "--object-set", "old"], ["--policy", "clear", "--episode", "x"]]
+)
+def test_evaluate_py_refuses_what_it_cannot_parse(run: Any, requests: list, arguments: list[str]) -> None:
+    code, _, err = run(EVALUATE.main, *arguments)
+    assert code == 2 and not requests
+    assert err.startswith("error: ") and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--policy", "strait"], "policy strait does not exist; allowed: random, guided, straight, clear, lookahead"),
+        (["--policy", "clear", "--episodes", "0"], "episodes = 0 is out of range"),
+        (["--policy", "clear", "--num-envs", "-1"], "num_envs = -1 is out of range"),
+        (["--policy", "clear", "--r-out", "0.01"], "task.r_in = 0.04 must be below task.r_out = 0.01"),
+        (["--policy", "clear", "--physics.threads", "-3"], "physics.threads = -3 is out of range"),
+        (["--policy", "clear", "--json", "."], ". is a folder; wanted the name of a file"),
+        (["--policy", "clear", "--video", "v.gif", "--video-episodes", "0"], "video_episodes = 0 is out of range"),
+    ],
+)
+def test_evaluate_py_refuses_in_one_line(run: Any, arguments: list[str], message: str) -> None:
+    code, out, err = run(EVALUATE.main, *arguments)
+    assert code == 2 and out == ""
+    assert err.startswith("error: ") and err.count("\n") == 1
+    assert message in err
+
+
+def test_a_policy_that_is_no_policy_is_refused(run: Any, tmp_path: Path) -> None:
+    code, _, err = run(EVALUATE.main, "--policy", str(tmp_path))
+    assert code == 2 and "neither a run folder nor a policy folder" in err and err.count("\n") == 1
+
+
+@pytest.fixture
+def fake_world(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
+    """Let players play in the world without physics, and collect the configurations it is made from."""
+    configs: list[Config] = []
+
+    def make(config: Config, **_: Any) -> Any:
+        configs.append(config)
+        return fake_env(task=config.task)
+
+    monkeypatch.setattr(player, "make_env", make)
+    monkeypatch.setattr(player, "with_task", lambda env, **_: env)
+    return configs
+
+
+@pytest.mark.parametrize("name", ["straight", "random", "lookahead"])
+def test_a_script_is_evaluated_by_name(fake_world: list[Config], name: str) -> None:
+    request = EvaluationConfig(policy=name, episodes=6, seed=2)
+    document = run_evaluation(request, make_player(request))
+    assert document["policy"] == name and len(document["rows"]) == 6
+    assert document["hull_bank_hash"] == "hulls" and document["scene_bank_hash"] == "scenes"
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+
+
+def test_a_trained_policy_keeps_its_task_and_meets_everybodys_scenes(fake_world: list[Config], tmp_path: Path) -> None:
+    trained = Config(
+        scene=SceneConfig(test_scenes=2, bank_seed=9),
+        task=TaskConfig(r_out=0.12, full_ring=True, camera="pinhole"),
+        network=PRESETS["ci"].network,
+    )
+    network = QNetwork(width=trained.network.width)
+    params = network.init(jax.random.key(0), np.zeros((1, 100, 100, 2), np.float32))["params"]
+    save_policy(tmp_path, params, trained, {})
+    request = EvaluationConfig(policy=str(tmp_path), episodes=3)
+    made = make_player(request)
+    document = run_evaluation(request, made)
+    assert fake_world[0].task == trained.task and fake_world[0].scene == SceneConfig()
+    assert document["camera"] == "pinhole" and document["episodes"] == 3
+    state = made.env.reset_to(jax.numpy.int32(0))
+    assert made.q_values is not None
+    q = np.where(np.asarray(made.env.action_mask(state.p1))[..., None], made.q_values(state), -np.inf)
+    assert int(made.policy(state, jax.random.key(0))) == q.argmax()
+
+
+def test_requests_override_the_camera_and_more_episodes_need_more_scenes(fake_world: list[Config]) -> None:
+    make_player(EvaluationConfig(policy="clear", camera="pinhole", r_out=0.2, episodes=300))
+    assert fake_world[0].task == TaskConfig(camera="pinhole", r_out=0.2)
+    assert fake_world[0].scene.test_scenes == 300
+
+
+def test_pretrained_is_a_policy_or_a_clear_refusal(fake_world: list[Config]) -> None:
+    if player.PRETRAINED.is_dir():
+        assert make_player(EvaluationConfig(policy="pretrained")).q_values is not None
+    else:
+        with pytest.raises(ValueError, match="ships no trained policy"):
+            make_player(EvaluationConfig(policy="pretrained"))
+
+
+def test_progress_line() -> None:
+    assert progress.describe(25, 100, 20, 60.0) == "episode 25 of 100 | success 80 % | left 3:00"
+
+
+def test_plain_progress_ends_with_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress.EpisodeProgress() as report:
+        for done in range(1, 5):
+            report(done, 4, done)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err == "episode 4 of 4 | success 100 % | left 0:00\n"
+
+
+def _evaluation_file(path: Path, policy: str, successes: list[int], **changes: Any) -> str:
+    rows = [{"scene": i, "target": "can", "success": bool(s)} for i, s in enumerate(successes)]
+    header = {"object_set": "seen", "hull_bank_hash": "h", "scene_bank_hash": "s", "camera": "orthographic"}
+    document = {"format": "pregrasp_jax evaluation 1", "policy": policy, "physics": "native", "seed": 0, "rows": rows}
+    path.write_text(json.dumps({**document, **header, **changes}))
+    return str(path)
+
+
+def test_compare_prints_and_writes(run: Any, tmp_path: Path) -> None:
+    a = _evaluation_file(tmp_path / "a.json", "mine", [1, 1, 1, 1, 1, 1, 0])
+    b = _evaluation_file(tmp_path / "b.json", "clear", [0, 0, 0, 0, 0, 0, 1])
+    code, out, _ = run(main_module.main, "compare", a, b, "--json", str(tmp_path / "c.json"))
+    assert code == 0
+    assert "mine" in out and "only A 6, only B 1" in out and "p = 0.125" in out
+    written = json.loads((tmp_path / "c.json").read_text())
+    assert written["p_value"] == 0.125 and written["policies"] == ["mine", "clear"]
+
+
+def test_compare_refuses_other_scenes(run: Any, tmp_path: Path) -> None:
+    a = _evaluation_file(tmp_path / "a.json", "mine", [1, 0])
+    b = _evaluation_file(tmp_path / "b.json", "clear", [1, 0], scene_bank_hash="t")
+    code, out, err = run(main_module.main, "compare", a, b)
+    assert (code, out) == (2, "")
+    assert err == "error: cannot pair: scene_bank_hash is s in the first file and t in the second\n"
+    assert run(main_module.main, "compare", a, str(tmp_path / "absent.json"))[0] == 2
+
+
+def test_doctor_names_what_a_bug_report_needs(run: Any) -> None:
+    code, out, _ = run(main_module.main, "doctor")
+    assert code == 0
+    lines = dict(line.split(maxsplit=1) for line in out.splitlines())
+    assert {"python", "mujoco", "jax", "cores", "NPROC", "cache", "free"} <= set(lines)
+    assert dict(doctor.describe())["engine native"] == "works"
+
+
+def test_assets_lists_and_draws_a_folder(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PREGRASP_JAX_CACHE", str(tmp_path / "cache"))
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    trimesh.creation.box((0.06, 0.06, 0.15)).export(meshes / "carton.stl")
+    trimesh.creation.box((60.0, 60.0, 150.0)).export(meshes / "millimetres.stl")
+    png = tmp_path / "sheet.png"
+    code, out, err = run(main_module.main, "assets", str(meshes), "--png", str(png))
+    assert code == 0, err
+    assert "carton" in out and "refused: millimetres.stl" in out
+    image = np.asarray(Image.open(png))
+    assert image.ndim == 3 and image.std() > 5
+
+
+def test_assets_refuses_a_folder_that_is_not_there(run: Any, tmp_path: Path) -> None:
+    code, _, err = run(main_module.main, "assets", str(tmp_path / "absent"), "--png", str(tmp_path / "a.png"))
+    assert code == 2 and err.startswith("error: ") and err.count("\n") == 1
+
+
+def test_describe_scenes_counts() -> None:
+    object_ids = np.full((3, 8), -1)
+    object_ids[0, :2], object_ids[1, :2], object_ids[2, :3] = (0, 1), (1, 2), (2, 0, 1)
+    scenes = SceneBank(
+        object_ids=object_ids,
+        poses=np.zeros((3, 8, 7), np.float32),
+        yaw=np.zeros(3, np.float32),
+        target=np.array([1, 0, 2]),
+        seeds=np.arange(3),
+        split="test",
+        tries=4,
+        content_hash="abc",
+    )
+    text = commands.describe_scenes(scenes, fake_env().bank)
+    assert text.splitlines() == [
+        "3 test scenes, 75% of 4 tries, hash abc",
+        "objects per scene: 2: 2, 3: 1",
+        "object  scenes  target",
+        "mug          2       0",
+        "can          3       3",
+        "box          2       0",
+    ]
+
+
+def test_refuse_unwritable(tmp_path: Path) -> None:
+    refuse_unwritable(None)
+    refuse_unwritable(tmp_path / "new" / "folder" / "a.json")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="is not a writable folder"):
+        refuse_unwritable(tmp_path / "file" / "a.json")
