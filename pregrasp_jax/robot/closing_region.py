@@ -15,7 +15,7 @@ from pregrasp_jax.robot import description
 from pregrasp_jax.types import OPEN, HullBank
 
 NUM_LINES = 48
-"""Lines over an object's extent along the hand; the coverage is good to 0.003."""
+"""Lines over an object's extent along the hand; the coverage is good to 0.004, on the worst of 2800 random objects."""
 
 
 def closing_region_bounds() -> tuple[np.ndarray, np.ndarray]:
@@ -48,7 +48,7 @@ def coverage(
     Returns:
         () in [0, 1]; 0 while the hand is closed (there is no region then) and where no hull is present.
 
-    Source: DESIGN, Closing region. Agrees with polygon clipping (shapely) within 0.003.
+    Source: DESIGN, Closing region. Agrees with polygon clipping (shapely) within 0.004.
     """
     xy = _in_hand_frame(transform_points(object_pose, vertices), hand_pose)
     ends = jax.vmap(lambda points, pairs: points[pairs])(xy, edges)
