@@ -227,8 +227,8 @@ def make_panel(
     """
     push_aperture, push = None, None
     if action is not None:
-        row, col, push_aperture = (int(x) for x in grid.decode_action(np.int32(action)))
-        push = tuple(p1), np.asarray(grid.cell_to_world(np.int32(row), np.int32(col)))
+        row, col, push_aperture = (int(x) for x in grid.decode_action(jnp.int32(action)))
+        push = p1, np.asarray(grid.cell_to_world(jnp.int32(row), jnp.int32(col))).tolist()
     values = np.zeros((*np.shape(mask), 2)) if q_values is None else np.asarray(q_values)
     allowed = values[np.asarray(mask, bool)]
     limits = (allowed.min(), allowed.max()) if allowed.size else (0.0, 1.0)

@@ -9,7 +9,7 @@ from heightmap_oracle import box_cloud, cast_rays, hull_planes, make_instances, 
 
 from pregrasp_jax import grid, heightmap
 from pregrasp_jax.geometry import transform_points
-from pregrasp_jax.robot import description, home, kinematics
+from pregrasp_jax.robot import description, kinematics, model
 from pregrasp_jax.types import (
     FULL_TOPOLOGY,
     MAX_HULLS,
@@ -27,8 +27,8 @@ from pregrasp_jax.types import (
 def joints() -> jax.Array:
     """An open hand in the middle of the workspace, 5 cm off the axis; one finger is less open than the other."""
     hand_pose = jnp.array([0.05, -0.05, 0.1, 1.0, 0.0, 0.0, 0.0])
-    arm = kinematics.nearest_solution(kinematics.hand_inverse_kinematics(hand_pose), jnp.asarray(home.home_joints()))
-    return jnp.append(arm, jnp.array([home.FINGER_OPEN, 0.6 * home.FINGER_OPEN]))
+    arm = kinematics.nearest_solution(kinematics.hand_inverse_kinematics(hand_pose), jnp.asarray(model.home_joint_pos()[:6]))
+    return jnp.append(arm, jnp.array([model.FINGER_OPEN, 0.6 * model.FINGER_OPEN]))
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def test_robot_is_drawn_where_mujoco_has_it(joints):
     """Against the MJCF's own capsules and boxes, not their polyhedra: outlines differ by the capsule error."""
     mj_model = description.robot_model()
     mj_data = mujoco.MjData(mj_model)
-    mj_data.qpos[home.joint_qpos_ids(mj_model)] = joints
+    mj_data.qpos[model.joint_qpos_ids(mj_model)] = joints
     # The tips follow the drivers; without a step their mimic joints are set by hand.
     for equality in range(mj_model.neq):
         follower, leader = mj_model.eq_obj1id[equality], mj_model.eq_obj2id[equality]
