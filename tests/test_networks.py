@@ -16,15 +16,19 @@ from pregrasp_jax.learning.networks import (
     upsample,
 )
 
-TINY = QNetwork(width=1 / 16)
-APPLY, Q_AT = q_functions(TINY)
+TINY = QNetwork(width=1 / 16, initial_bias=0.7)
+APPLY, Q_AT = map(jax.jit, q_functions(TINY))
+
+
+@functools.cache
+def initial_params():
+    return jax.jit(TINY.init)(jax.random.key(1), jnp.zeros((1, 20, 20, 2)))
 
 
 @functools.cache
 def tiny_params():
     """Random weights and biases: a readout of full gain and biases that are not 0, as after training."""
-    params = jax.jit(TINY.init)(jax.random.key(1), jnp.zeros((1, 20, 20, 2)))
-    leaves, treedef = jax.tree.flatten(params)
+    leaves, treedef = jax.tree.flatten(initial_params())
     keys = jax.random.split(jax.random.key(2), len(leaves))
     return treedef.unflatten(
         [leaf + 0.1 * jax.random.normal(k, leaf.shape) for leaf, k in zip(leaves, keys, strict=True)]
@@ -87,7 +91,7 @@ def test_parameter_count(width, millions):
 def test_output_agrees_with_figure_3_in_float64():
     x = jax.random.normal(jax.random.key(0), (100, 100, 2))
     expected = figure_3(x, tiny_params())
-    q = jax.jit(APPLY)(tiny_params(), x[None])[0]
+    q = APPLY(tiny_params(), x[None])[0]
     assert q.shape == (100, 100, 2) and q.dtype == jnp.float32
     assert expected.std() > 0.1
     np.testing.assert_allclose(q, expected, atol=2e-5 * np.abs(expected).max())
@@ -130,24 +134,23 @@ def test_receptive_field_covers_every_row_and_column():
     x = jnp.broadcast_to(jax.random.normal(jax.random.key(4), (1, 100, 100, 2)), (100, 100, 100, 2))
     row = jnp.arange(100)
     q = jax.jit(lambda p, x: TINY.apply(p, x, row, row[::-1], method="q_at"))(tiny_params(), x)
-    whole = jax.jit(APPLY)(tiny_params(), x[:1])[0]
+    whole = APPLY(tiny_params(), x[:1])[0]
     np.testing.assert_allclose(q, whole[row, row[::-1]], atol=1e-5 * float(jnp.abs(whole).max()))
 
 
 def test_taken_actions_are_flat_indices():
-    x = jax.random.normal(jax.random.key(0), (4, 100, 100, 2))
+    x = jax.random.normal(jax.random.key(0), (1, 100, 100, 2))
     action = jnp.array([0, 1, 19_999, 2 * (37 * 100 + 81) + 1])
-    whole = jax.jit(APPLY)(tiny_params(), x).reshape(4, -1)
-    taken = jax.jit(Q_AT)(tiny_params(), x, action)
-    np.testing.assert_allclose(taken, whole[jnp.arange(4), action], atol=1e-5 * float(jnp.abs(whole).max()))
+    whole = APPLY(tiny_params(), x).ravel()
+    taken = Q_AT(tiny_params(), jnp.broadcast_to(x, (4, *x.shape[1:])), action)
+    np.testing.assert_allclose(taken, whole[action], atol=1e-5 * float(jnp.abs(whole).max()))
 
 
 def test_unbatched_equals_batched():
     x = jax.random.normal(jax.random.key(0), (2, 20, 12, 2))
-    apply = jax.jit(APPLY)
-    batched = apply(tiny_params(), x)
+    batched = APPLY(tiny_params(), x)
     assert batched.shape == (2, 20, 12, 2)
-    np.testing.assert_allclose(apply(tiny_params(), x[1]), batched[1], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(APPLY(tiny_params(), x[1]), batched[1], rtol=1e-5, atol=1e-5)
 
 
 def test_max_pool_agrees_with_the_window_operation_and_its_gradient():
@@ -180,9 +183,8 @@ def test_interpolation_weights_beyond_the_border_are_zero():
 
 
 def test_initial_values_are_the_bias():
-    x = jax.random.normal(jax.random.key(0), (2, 40, 40, 2))
-    network = QNetwork(width=1 / 16, initial_bias=0.7)
-    q = jax.jit(q_functions(network)[0])(jax.jit(network.init)(jax.random.key(0), x), x)
+    x = jax.random.normal(jax.random.key(0), (1, 100, 100, 2))
+    q = APPLY(initial_params(), x)
     np.testing.assert_allclose(q, 0.7, atol=0.15)
     assert float(jnp.std(q)) > 1e-4
 
@@ -196,9 +198,9 @@ def test_activations_keep_their_scale_without_normalisation():
 
 
 def test_bfloat16_computes_and_returns_float32():
-    x = jax.random.normal(jax.random.key(0), (1, 40, 40, 2))
+    x = jax.random.normal(jax.random.key(0), (1, 100, 100, 2))
     half = QNetwork(width=1 / 16, dtype=jnp.bfloat16)
-    q, reference = jax.jit(q_functions(half)[0])(tiny_params(), x), jax.jit(APPLY)(tiny_params(), x)
+    q, reference = jax.jit(q_functions(half)[0])(tiny_params(), x), APPLY(tiny_params(), x)
     assert q.dtype == jnp.float32
     assert float(jnp.max(jnp.abs(q - reference))) < 0.1 * float(jnp.max(jnp.abs(reference)))
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(jax.eval_shape(half.init, jax.random.key(0), x)))
