@@ -9,6 +9,7 @@ from PIL import Image
 from pregrasp_jax import drawing, grid
 from pregrasp_jax.assets.bank import select
 from pregrasp_jax.assets.catalogue import builtin_bank
+from pregrasp_jax.drawing import shaded
 from pregrasp_jax.types import OPEN, ROBOT_ID, Observation
 
 SHAPE = (60, 80)
@@ -48,7 +49,7 @@ def test_light_comes_from_above_and_casts_shadows():
     darker = (empty - lit).mean(axis=-1) > 40
     # The lamp is at -x, -y: the shadow falls to the right and away from the viewer.
     assert darker[:25, 45:].sum() > 10 and not darker[40:, :30].any()
-    normals = drawing._normals(
+    normals = shaded._normals(
         np.asarray(hulls.planes), np.array([1, 1, 0]), np.array([[0, 0, 0.15], [0, -0.05, 0.1], [1, 1, 0]])
     )
     np.testing.assert_allclose(normals, [[0, 0, 1], [0, -1, 0], [0, 0, 1]], atol=1e-6)

@@ -1,0 +1,123 @@
+"""Pictures side by side: the panel of one decision, the contact sheet of a bank; and their files."""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from pregrasp_jax import grid
+from pregrasp_jax.drawing.maps import draw_heightmap, draw_q_map, draw_segmentation
+from pregrasp_jax.drawing.shaded import draw_camera, look_at, side_view
+from pregrasp_jax.heightmap import HullInstances, object_hulls
+from pregrasp_jax.io import write_bytes
+from pregrasp_jax.types import CLOSED, OPEN, HullBank, Observation
+
+_INK, _PAPER = (38, 40, 44), (250, 249, 246)
+"""Colours of text and background."""
+
+
+def make_panel(
+    hulls: HullInstances,
+    obs: Observation,
+    target_slot: int,
+    *,
+    p1: Sequence[float],
+    mask: np.ndarray,
+    q_values: np.ndarray | None = None,
+    action: int | None = None,
+    title: str = "",
+) -> np.ndarray:
+    """Draw scene | height | segmentation | Q closed | Q open, with the half ring and the chosen push.
+
+    Args:
+        hulls: what stands on the table (unbatched).
+        obs: what the policy sees.
+        target_slot: the slot of the target.
+        p1: (x, y) m, where the push starts.
+        mask: [H, W] bool, where it may end.
+        q_values: [H, W, 2], or None for a policy without Q-values.
+        action: flat index of the chosen push, drawn on the map of its aperture.
+        title: one line above the panel.
+
+    Returns:
+        [rows, columns, 3] uint8.
+    """
+    push_aperture, push = None, None
+    if action is not None:
+        row, col, push_aperture = (int(x) for x in grid.decode_action(jnp.int32(action)))
+        push = p1, np.asarray(grid.cell_to_world(jnp.int32(row), jnp.int32(col))).tolist()
+    values = np.zeros((*np.shape(mask), 2)) if q_values is None else np.asarray(q_values)
+    allowed = values[np.asarray(mask, bool)]
+    limits = (allowed.min(), allowed.max()) if allowed.size else (0.0, 1.0)
+    scene = draw_camera(hulls, target_slot=target_slot, camera=side_view((300, 400)))
+    tiles = [("scene", scene), ("height, 0 to 0.30 m", draw_heightmap(np.asarray(obs.height)))]
+    tiles.append(("segmentation", draw_segmentation(np.asarray(obs.instance_ids), target_slot=target_slot)))
+    for aperture, name in ((CLOSED, "closed"), (OPEN, "open")):
+        chosen = push if aperture == push_aperture else None
+        image = draw_q_map(values[..., aperture], mask, push=chosen, limits=limits, backdrop=np.asarray(obs.height))
+        span = "" if q_values is None else f" {limits[0]:.2f} to {limits[1]:.2f}"
+        tiles.append((f"{'push' if q_values is None else 'Q'} {name}{span}", image))
+    return _row(tiles, title=title, footer="maps: seen from above, +x right, +y up")
+
+
+def contact_sheet(bank: HullBank, *, columns: int = 6) -> np.ndarray:
+    """Draw every object of a bank with its name, size, mass, and whether it may be a target."""
+    tiles = []
+    for index, name in enumerate(bank.names):
+        pose = jnp.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
+        hulls = object_hulls(bank, jnp.array([index]), pose)
+        points = np.asarray(hulls.vertices)[np.asarray(hulls.present)].reshape(-1, 3)
+        wide, deep, high = np.ptp(points, axis=0)
+        view = look_at((0.25, -0.62, 0.42), (0.0, 0.0, 0.115), fovy=np.deg2rad(27.0), shape=(220, 220))
+        image = draw_camera(hulls, camera=view)
+        eligible = "target or obstacle" if bool(np.asarray(bank.eligible)[index]) else "obstacle only"
+        size = f"{wide * 100:.1f} x {deep * 100:.1f} x {high * 100:.1f} cm"
+        pieces = int(np.asarray(hulls.present).sum())
+        mass = f"{float(np.asarray(bank.mass)[index]):.2f} kg, {pieces} hull{'s' if pieces > 1 else ''}"
+        tiles.append((f"{name}\n{size}\n{mass}\n{eligible}", image))
+    rows = [_row(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
+    width = max(row.shape[1] for row in rows)
+    return np.concatenate([np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=250) for r in rows])
+
+
+def save_png(path: Path, image: np.ndarray) -> None:
+    """Write an image as PNG, whole or not at all."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, format="PNG")
+    write_bytes(Path(path), buffer.getvalue())
+
+
+def save_gif(path: Path, frames: Sequence[np.ndarray], *, seconds_per_frame: float = 1.0) -> None:
+    """Write images of one shape as an endless animation, whole or not at all.
+
+    Raises:
+        ValueError: no frames.
+    """
+    if not frames:
+        raise ValueError(f"{path}: an animation needs at least one frame")
+    pictures = [Image.fromarray(frame).quantize(128, dither=Image.Dither.NONE) for frame in frames]
+    buffer = io.BytesIO()
+    duration = round(1000 * seconds_per_frame)
+    pictures[0].save(buffer, format="GIF", save_all=True, append_images=pictures[1:], duration=duration, loop=0)
+    write_bytes(Path(path), buffer.getvalue())
+
+
+def _row(tiles: Sequence[tuple[str, np.ndarray]], *, title: str = "", footer: str = "", gap: int = 8) -> np.ndarray:
+    """Set captioned images of one height side by side."""
+    font = ImageFont.load_default(13)
+    lines = max(caption.count("\n") + 1 for caption, _ in tiles)
+    top, caption_height, bottom = (26 if title else gap), 17 * lines + gap, (22 if footer else 0)
+    width = gap + sum(image.shape[1] + gap for _, image in tiles)
+    picture = Image.new("RGB", (width, top + tiles[0][1].shape[0] + caption_height + bottom), _PAPER)
+    canvas = ImageDraw.Draw(picture)
+    canvas.text((gap, 5), title, fill=_INK, font=ImageFont.load_default(15))
+    left = gap
+    for caption, image in tiles:
+        picture.paste(Image.fromarray(image), (left, top))
+        canvas.multiline_text((left, top + image.shape[0] + 3), caption, fill=_INK, font=font, spacing=3)
+        left += image.shape[1] + gap
+    canvas.text((gap, picture.height - 20), footer, fill=_INK, font=font)
+    return np.asarray(picture)
