@@ -137,7 +137,7 @@ def measure_stages(env: Env, state: EnvState, key: jax.Array) -> dict[str, float
 
 def pybullet_worker(num_steps: int, seed: int, queue: Any) -> None:
     """Push through the same packed scenes with a floating hand in PyBullet; put steps and seconds on the queue."""
-    import pybullet as p
+    import pybullet as p  # pyright: ignore[reportMissingImports]
 
     env = make_env(PRESETS["cpu"], split="validation", threads=1)
     rng = np.random.default_rng(seed)

@@ -134,7 +134,7 @@ def plan_arm(joints: jax.Array, positions: jax.Array) -> tuple[jax.Array, jax.Ar
     branch = jnp.argmin(jnp.where(jnp.isnan(gap), jnp.inf, gap))
     path = jnp.unwrap(branches[:, branch], axis=0)
     path += (candidates[branch] - path[0])[None]
-    velocity = jnp.gradient(path, CTRL_DT, axis=0)
+    velocity = jnp.asarray(jnp.gradient(path, CTRL_DT, axis=0))
     solved = ~jnp.any(jnp.isnan(path) | jnp.isnan(velocity), axis=-1)
     path, velocity = (jnp.where(solved[:, None], x, 0.0) for x in (path, velocity))
     low, high = kinematics.joint_limits().T

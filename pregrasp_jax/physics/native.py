@@ -159,17 +159,22 @@ def make_engine(bank: HullBank, *, threads: int = 0) -> Engine:
     """
     simulations = Simulations(slot_model.make_slot_model(robot.load_spec(), bank), threads=threads)
     shapes = NativeState(
-        bits=jax.ShapeDtypeStruct((2 * simulations.state_size,), jnp.uint32),
-        object_ids=jax.ShapeDtypeStruct((MAX_OBJECTS,), jnp.int32),
-        object_poses=jax.ShapeDtypeStruct((MAX_OBJECTS, 7), jnp.float32),
-        joint_pos=jax.ShapeDtypeStruct((8,), jnp.float32),
-        diverged=jax.ShapeDtypeStruct((), jnp.bool_),
+        *(
+            jax.ShapeDtypeStruct(shape, dtype)  # pyright: ignore[reportArgumentType]
+            for shape, dtype in (
+                ((2 * simulations.state_size,), jnp.uint32),
+                ((MAX_OBJECTS,), jnp.int32),
+                ((MAX_OBJECTS, 7), jnp.float32),
+                ((8,), jnp.float32),
+                ((), jnp.bool_),
+            )
+        )
     )
 
     def package(state: np.ndarray, object_ids: np.ndarray, diverged: np.ndarray, batch: tuple[int, ...]) -> NativeState:
         object_poses, joint_pos = simulations.describe(state)
-        flat = NativeState(_to_bits(state), object_ids.astype(np.int32), object_poses, joint_pos, diverged)
-        return jax.tree.map(lambda x: x.reshape((*batch, *x.shape[1:])), flat)
+        leaves = (_to_bits(state), object_ids.astype(np.int32), object_poses, joint_pos, diverged)
+        return NativeState(*(x.reshape((*batch, *x.shape[1:])) for x in leaves))  # pyright: ignore[reportArgumentType]
 
     def host_reset(object_ids: Any, poses: Any) -> NativeState:
         object_ids, poses = np.asarray(object_ids), np.asarray(poses)

@@ -26,7 +26,8 @@ Progress = Callable[[int, int], None]
 
 _CHUNK = 16
 _FIELDS = ("object_ids", "poses", "yaw", "target", "seeds")
-_MIN_ACCEPTANCE = 0.1
+_MIN_TRIES, _MIN_ACCEPTANCE = 4 * _CHUNK, 0.1
+"""A set of which so few tries succeed after so many is refused."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ def build(
     rows: list[tuple[np.ndarray, np.ndarray, float, int, int]] = []
     tries = 0
     while len(rows) < wanted:
-        if tries >= 20 * _CHUNK and len(rows) < _MIN_ACCEPTANCE * tries:
+        if tries >= _MIN_TRIES and len(rows) < _MIN_ACCEPTANCE * tries:
             raise ValueError(
                 f"scene bank: only {len(rows)} of {tries} tries were packed; at least "
                 f"{_MIN_ACCEPTANCE:.0%} is needed. Use objects that stand by themselves, or fewer of them"

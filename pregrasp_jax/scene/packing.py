@@ -39,7 +39,8 @@ MAX_REST_SPEED = 0.02
 MAX_RADIUS = 0.235
 """m; a packed scene lies within this distance of the centre, so that no yaw brings it to the open hand."""
 _PLACE_GAP = 0.004
-_PLACE_TRIES = 200
+_PLACE_STEP = 0.005
+"""m; start gap between two footprints, and step of the search for a free place."""
 
 
 def table_spec() -> mujoco.MjSpec:
@@ -62,15 +63,10 @@ def place(radii: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """
     poses = np.zeros((len(radii), 7))
     for i, radius in enumerate(radii):
-        angle, distance = rng.uniform(0, 2 * np.pi), 0.0
-        direction = np.array([np.cos(angle), np.sin(angle)])
-        for _ in range(_PLACE_TRIES):
-            xy = distance * direction
-            gaps = np.linalg.norm(poses[:i, :2] - xy, axis=1) - radii[:i] - radius
-            if (gaps > _PLACE_GAP).all():
-                break
-            distance += 0.005
-        yaw = rng.uniform(0, 2 * np.pi)
+        angle, yaw = rng.uniform(0, 2 * np.pi, 2)
+        direction, xy = np.array([np.cos(angle), np.sin(angle)]), np.zeros(2)
+        while (np.linalg.norm(poses[:i, :2] - xy, axis=1) < radii[:i] + radius + _PLACE_GAP).any():
+            xy = xy + _PLACE_STEP * direction
         poses[i] = [*xy, 0.0, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
     return poses
 
