@@ -27,7 +27,8 @@ from pregrasp_jax.types import (
 def joints() -> jax.Array:
     """An open hand in the middle of the workspace, 5 cm off the axis; one finger is less open than the other."""
     hand_pose = jnp.array([0.05, -0.05, 0.1, 1.0, 0.0, 0.0, 0.0])
-    arm = kinematics.nearest_solution(kinematics.hand_inverse_kinematics(hand_pose), jnp.asarray(model.home_joint_pos()[:6]))
+    home = jnp.asarray(model.home_joint_pos()[:6])
+    arm = kinematics.nearest_solution(kinematics.hand_inverse_kinematics(hand_pose), home)
     return jnp.append(arm, jnp.array([model.FINGER_OPEN, 0.6 * model.FINGER_OPEN]))
 
 
