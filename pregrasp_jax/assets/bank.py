@@ -27,7 +27,7 @@ DEFAULT_DENSITY = 300.0
 DEFAULT_FRICTION = 0.25
 """Sliding friction between objects."""
 
-_FORMAT = "pregrasp_jax hull bank 1"
+FORMAT = "pregrasp_jax hull bank 1"
 """First entry of a bank file; the number changes with the meaning of the arrays."""
 
 _PER_OBJECT = ("mass", "com", "inertia", "inertia_quat", "friction", "height", "min_width", "best_coverage", "eligible")
@@ -55,19 +55,18 @@ def make_bank(objects: Sequence[ConvexObject]) -> HullBank:
     """Return the bank of several objects, in order.
 
     Raises:
-        ValueError: no object, a repeated name, or an object of more than `MAX_HULLS` parts or a flat part.
+        ValueError: a repeated name, or an object of more than `MAX_HULLS` parts or a flat part.
     """
     return concatenate([_make_single(item) for item in objects])
 
 
 def concatenate(banks: Sequence[HullBank]) -> HullBank:
-    """Join banks; hull indices are shifted, object order is kept.
+    """Join any number of banks; hull indices are shifted, object order is kept.
 
     Raises:
-        ValueError: no bank, or two objects of the same name.
+        ValueError: two objects of the same name.
     """
-    if not banks:
-        raise ValueError("a hull bank needs at least 1 object, got 0")
+    banks = [_empty(), *banks]
     shifts = np.cumsum([0] + [len(bank.full.vertices) for bank in banks[:-1]])
     ids = [np.asarray(bank.object_hulls) for bank in banks]
     return _finish(
@@ -120,7 +119,7 @@ def save_bank(path: Path, bank: HullBank) -> None:
     arrays |= {key: getattr(bank, key) for key in ("object_hulls", *_PER_OBJECT)}
     io.write_npz(
         path,
-        format=np.array(_FORMAT),
+        format=np.array(FORMAT),
         content_hash=np.array(bank.content_hash),
         names=np.array(bank.names),
         **{key: np.asarray(value) for key, value in arrays.items()},
@@ -136,7 +135,7 @@ def load_bank(path: Path) -> HullBank:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
-        if str(arrays.pop("format")) != _FORMAT:
+        if str(arrays.pop("format")) != FORMAT:
             raise ValueError("format differs")
         recorded = str(arrays.pop("content_hash"))
         names = tuple(str(name) for name in arrays.pop("names"))
@@ -151,8 +150,19 @@ def load_bank(path: Path) -> HullBank:
     except FileNotFoundError:
         raise
     except Exception as error:
-        raise ValueError(f"{path}: not a readable '{_FORMAT}' file ({error}); delete it and build it again") from error
+        raise ValueError(f"{path}: not a readable '{FORMAT}' file ({error}); delete it and build it again") from error
     return bank
+
+
+def _empty() -> HullBank:
+    """Return the bank of no object."""
+    full, coarse = (
+        Hulls(vertices=jnp.zeros((0, v, 3)), planes=jnp.zeros((0, f, 4)), edges=jnp.zeros((0, e, 2), jnp.int32))
+        for v, f, e in (FULL_TOPOLOGY, COARSE_TOPOLOGY)
+    )
+    widths = {"com": (0, 3), "inertia": (0, 3), "inertia_quat": (0, 4)}
+    rows = {key: np.zeros(widths.get(key, (0,))) for key in _PER_OBJECT}
+    return _finish(full=full, coarse=coarse, object_hulls=np.zeros((0, MAX_HULLS)), names=(), **rows)
 
 
 def _make_single(item: ConvexObject) -> HullBank:
@@ -207,7 +217,7 @@ def _finish(
         content_hash="",
         **{key: jnp.asarray(value, bool if key == "eligible" else jnp.float32) for key, value in rows.items()},
     )
-    digest = io.content_hash(_FORMAT, list(names), *[np.asarray(leaf) for leaf in jax.tree.leaves(bank)])
+    digest = io.content_hash(FORMAT, list(names), *[np.asarray(leaf) for leaf in jax.tree.leaves(bank)])
     return bank.replace(content_hash=digest)
 
 

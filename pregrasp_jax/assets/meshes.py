@@ -1,0 +1,313 @@
+"""Folders of meshes: load, check, decompose in parallel, cache, and refuse with a reason.
+
+One bad mesh never stops the rest: it becomes a `Refusal`, one line that names what is wrong and what is allowed.
+"""
+
+import io as memory
+import logging
+import multiprocessing
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull
+
+from pregrasp_jax import io
+from pregrasp_jax.assets import decompose
+from pregrasp_jax.assets.bank import FORMAT, ConvexObject, concatenate, load_bank, make_bank, save_bank
+from pregrasp_jax.assets.settings import SETTINGS_FILE, UP_AXES, ObjectSettings, load_settings
+from pregrasp_jax.grid import MAX_HEIGHT
+from pregrasp_jax.types import HullBank
+
+Progress = Callable[[int, int, str], object]
+"""Called as (done, total, file name) in the calling process."""
+
+SUFFIXES = (".obj", ".stl", ".ply", ".glb")
+
+MIN_OBJECT_HEIGHT = 0.11
+"""m; the hand pushes at 0.1 m, lower objects would pass under it."""
+
+MAX_OBJECT_HEIGHT = MAX_HEIGHT
+"""m; heightmaps end there."""
+
+MAX_OBJECT_WIDTH = 0.2
+"""m; wider objects leave no room in the 0.5 m workspace."""
+
+MIN_OBJECT_WIDTH = 0.01
+"""m; thinner objects are flat."""
+
+MIN_TIP_ANGLE = 0.05
+"""rad by which the centre of mass must lie inside the base, seen from the centre of mass."""
+
+MAX_BYTES = 256 * 2**20
+"""Largest mesh file; 2 M faces are 100 MB of binary STL."""
+
+_WORKERS = 2
+
+_UNITS = (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254), ("kilometres", 1e3))
+
+
+class Refusal(NamedTuple):
+    """A mesh that was not loaded.
+
+    Attributes:
+        name: file name inside the folder.
+        reason: one line: what is wrong, what is allowed.
+    """
+
+    name: str
+    reason: str
+
+
+class _Job(NamedTuple):
+    """One mesh to load: object name, file, settings."""
+
+    name: str
+    path: Path
+    settings: ObjectSettings
+
+
+def load_object_dir(
+    object_dir: Path, object_set: str, *, progress: Progress | None = None
+) -> tuple[HullBank, list[Refusal]]:
+    """Load every mesh of a folder as convex hulls, in the order of the file names.
+
+    Args:
+        object_dir: folder of meshes in m, z up (or as `objects.yaml` says); with subfolders `seen` and `unseen`
+            the one named by `object_set` is read, otherwise the folder itself is the seen set.
+        object_set: `seen` or `unseen`.
+        progress: called after every mesh.
+
+    Returns:
+        The bank of all good meshes (empty if there is none), and one refusal for every other.
+
+    Raises:
+        ValueError: the folder or the set does not exist, holds no mesh, or `objects.yaml` is wrong.
+    """
+    folder = mesh_folder(Path(object_dir), object_set)
+    jobs, refusals = _list_jobs(folder)
+    banks: dict[str, HullBank] = {}
+    done = len(refusals)
+    total = done + len(jobs)
+    for job, result in _results(jobs):
+        if isinstance(result, str):
+            refusals.append(Refusal(job.path.name, result))
+        else:
+            banks[job.name] = result
+        done += 1
+        if progress is not None:
+            progress(done, total, job.path.name)
+    return concatenate([banks[job.name] for job in jobs if job.name in banks]), sorted(refusals)
+
+
+def mesh_folder(object_dir: Path, object_set: str) -> Path:
+    """Return the folder that holds the meshes of a set.
+
+    Raises:
+        ValueError: it does not exist.
+    """
+    sets = ("seen", "unseen")
+    if object_set not in sets:
+        raise ValueError(f"object set '{object_set}' is unknown; allowed are {', '.join(sets)}")
+    if not object_dir.is_dir():
+        raise ValueError(f"{object_dir}: no such folder; allowed is a folder of {', '.join(SUFFIXES)} files")
+    present = [name for name in sets if (object_dir / name).is_dir()]
+    if object_set in present:
+        return object_dir / object_set
+    if present or object_set != "seen":
+        raise ValueError(f"{object_dir}: has no '{object_set}' set; allowed here are {', '.join(present or ['seen'])}")
+    return object_dir
+
+
+def load_mesh(path: Path, settings: ObjectSettings) -> trimesh.Trimesh:
+    """Read one mesh file, check it, and return it repaired, in metres, z up.
+
+    Raises:
+        ValueError: one line about what is wrong with it.
+    """
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        raise ValueError(f"file of {size / 2**20:.0f} MB; allowed are {MAX_BYTES // 2**20} MB, decimate it first")
+    mesh = _parse(path.read_bytes(), path.suffix[1:].lower())
+    if len(mesh.faces) == 0:
+        raise ValueError(f"empty: {len(mesh.vertices)} vertices and no faces; allowed is a triangle mesh")
+    used = np.asarray(mesh.vertices, np.float64)[np.unique(mesh.faces)]
+    bad = int((~np.isfinite(used).all(axis=1)).sum())
+    if bad:
+        raise ValueError(f"{bad} of {len(used)} vertices are NaN or infinite; allowed are finite coordinates")
+    mesh.vertices = _upright(np.asarray(mesh.vertices, np.float64) * settings.scale, settings.up)
+    _check_size(_upright(used * settings.scale, settings.up), settings)
+    mesh = decompose.repair(mesh)
+    if len(mesh.faces) == 0:
+        raise ValueError("all faces are degenerate or duplicates; allowed is a surface that encloses a volume")
+    return mesh
+
+
+def make_object(name: str, path: Path, settings: ObjectSettings) -> ConvexObject:
+    """Read and decompose one mesh file.
+
+    Raises:
+        ValueError: one line about what is wrong with it.
+    """
+    parts = decompose.decompose(load_mesh(path, settings))
+    return ConvexObject(name, parts, mass=settings.mass, density=settings.density, friction=settings.friction)
+
+
+def tip_angle(bank: HullBank, index: int) -> float:
+    """Return by how much, in rad, an object may be tilted before it falls; negative if it does not stand at all."""
+    ids = np.asarray(bank.object_hulls[index])
+    points = np.asarray(bank.full.vertices, np.float64)[ids[ids >= 0]].reshape(-1, 3)
+    base = points[points[:, 2] == 0.0, :2]
+    if np.linalg.matrix_rank(base - base[0], tol=1e-3) < 2:
+        return -np.pi / 2
+    margin = -ConvexHull(base).equations[:, 2].max()
+    return float(np.arctan2(margin, bank.com[index, 2]))
+
+
+def _list_jobs(folder: Path) -> tuple[list[_Job], list[Refusal]]:
+    """Pair every mesh of a folder with its settings; refuse what is missing or leads out of the folder."""
+    defaults, listed = load_settings(folder)
+    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+    refusals = [
+        Refusal(name, f"listed in {SETTINGS_FILE} but {_why_absent(folder, name)}")
+        for name in listed
+        if name not in {path.name for path in paths}
+    ]
+    if not paths:
+        raise ValueError(f"{folder}: holds no mesh; allowed are {', '.join(SUFFIXES)} files")
+    jobs = []
+    for path in paths:
+        if not path.resolve().is_relative_to(folder.resolve()):
+            refusals.append(Refusal(path.name, "link that leads out of the folder; allowed are files inside of it"))
+        elif not path.is_file():
+            refusals.append(Refusal(path.name, "missing or not a file; allowed are files inside the folder"))
+        else:
+            unique = sum(other.stem == path.stem for other in paths) == 1
+            jobs.append(_Job(path.stem if unique else path.name, path, listed.get(path.name, defaults)))
+    return jobs, refusals
+
+
+def _why_absent(folder: Path, name: str) -> str:
+    if not (folder / name).resolve().is_relative_to(folder.resolve()):
+        return "leads out of the folder; allowed are names of files inside of it"
+    if Path(name).suffix.lower() not in SUFFIXES:
+        return f"not a mesh; allowed are {', '.join(SUFFIXES)}"
+    return f"missing; allowed are names of files in {folder.name}"
+
+
+def _results(jobs: Sequence[_Job]):
+    """Yield every job with its bank of one object, or the reason for its refusal; cached ones first."""
+    pending: list[tuple[_Job, Path]] = []
+    for job in jobs:
+        cached = io.cache_dir() / "hulls" / f"{_cache_key(job)}.npz"
+        try:
+            yield job, load_bank(cached)
+        except (OSError, ValueError):  # absent or damaged: build it again
+            pending.append((job, cached))
+    for index, made in _decompose_all([job for job, _ in pending]):
+        job, cached = pending[index]
+        result = _finish(made) if isinstance(made, ConvexObject) else made
+        if isinstance(result, HullBank):
+            save_bank(cached, result)
+        yield job, result
+
+
+def _cache_key(job: _Job) -> str:
+    data = job.path.read_bytes() if job.path.stat().st_size <= MAX_BYTES else b""
+    return io.content_hash(data, job.path.suffix, job.name, asdict(job.settings), decompose.VERSION, FORMAT)
+
+
+def _decompose_all(jobs: Sequence[_Job]):
+    """Yield (index, object or reason) from worker processes, in order of completion.
+
+    CoACD is native code: a mesh that makes it crash takes its process down, so after a crash the unfinished
+    meshes run one process each and only the guilty one is refused.
+    """
+    unfinished = dict(enumerate(jobs))
+    for width in (_WORKERS, 1):
+        batches = [list(unfinished)] if width > 1 else [[index] for index in unfinished]
+        for batch in filter(None, batches):
+            with ProcessPoolExecutor(width, mp_context=multiprocessing.get_context("spawn")) as pool:
+                futures = {pool.submit(_try_job, jobs[index]): index for index in batch}
+                for future in as_completed(futures):
+                    if not isinstance(future.exception(), BrokenProcessPool):
+                        del unfinished[futures[future]]
+                        yield futures[future], future.result()
+    for index in unfinished:
+        yield (
+            index,
+            "the worker process died; allowed are meshes that CoACD can decompose (a script of your own must "
+            "guard its entry point with `if __name__ == '__main__'`)",
+        )
+
+
+def _try_job(job: _Job) -> ConvexObject | str:
+    """Run in a worker: the object, or why it is refused."""
+    logging.disable(logging.WARNING)  # trimesh comments on every oddity that the checks below report
+    try:
+        return make_object(job.name, job.path, job.settings)
+    except Exception as error:
+        return _one_line(error)
+
+
+def _finish(item: ConvexObject) -> HullBank | str:
+    """Build the bank of one object and check that it stands; else the reason."""
+    try:
+        bank = make_bank([item])
+    except ValueError as error:
+        return _one_line(error)
+    angle = tip_angle(bank, 0)
+    if angle < MIN_TIP_ANGLE:
+        return (
+            f"does not stand: tips over at {angle:.2f} rad, must be >= {MIN_TIP_ANGLE}; "
+            f"another up axis ({', '.join(UP_AXES)}) can be set in {SETTINGS_FILE}"
+        )
+    return bank
+
+
+def _parse(data: bytes, file_type: str) -> trimesh.Trimesh:
+    """Parse from memory, without a resolver: a mesh file cannot make us open another file."""
+    options: dict[str, Any] = {"skip_materials": True} if file_type == "obj" else {}
+    try:
+        scene = trimesh.load_scene(memory.BytesIO(data), file_type=file_type, process=False, **options)
+        mesh = scene.to_mesh()
+    except Exception as error:
+        raise ValueError(f"not a readable .{file_type} file: {_one_line(error)}") from error
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+def _upright(vertices: np.ndarray, up: str) -> np.ndarray:
+    """Rotate vertices so that the axis `up` becomes z: cyclic for the axis, half a turn about x for its sign."""
+    vertices = np.roll(vertices, 2 - "xyz".index(up[-1]), axis=1)
+    return vertices * [1.0, -1.0, -1.0] if up.startswith("-") else vertices
+
+
+def _check_size(vertices: np.ndarray, settings: ObjectSettings) -> None:
+    """Refuse wrong units, flat objects, and objects outside of what the task can handle."""
+    size = np.ptp(vertices, axis=0)
+    text = " x ".join(f"{extent * 1e3:.4g}" for extent in size) + " mm"
+    if size.max() > 1.0 or size.max() < 0.01:
+        hint = ", ".join(
+            f"scale: {unit * settings.scale:g} if the file is in {name}"
+            for name, unit in _UNITS
+            if MIN_OBJECT_HEIGHT / 2 <= size.max() * unit <= 2 * MAX_OBJECT_HEIGHT
+        )
+        hint = hint or f"a scale that makes it {MIN_OBJECT_HEIGHT:g} to {MAX_OBJECT_HEIGHT:g} m tall"
+        raise ValueError(f"wrong unit: {text}, allowed are 0.01 to 1 m; set {hint} in {SETTINGS_FILE}")
+    if size.min() < MIN_OBJECT_WIDTH:
+        raise ValueError(f"flat: {text}; allowed is at least {MIN_OBJECT_WIDTH * 1e3:g} mm in every direction")
+    if not MIN_OBJECT_HEIGHT <= size[2] <= MAX_OBJECT_HEIGHT:
+        what = "too low" if size[2] < MIN_OBJECT_HEIGHT else "too tall"
+        allowed = f"allowed heights are {MIN_OBJECT_HEIGHT:g} to {MAX_OBJECT_HEIGHT:g} m"
+        raise ValueError(f"{what}: {text}, up is {settings.up}; {allowed}, scale and up can be set in {SETTINGS_FILE}")
+    if size[:2].max() > MAX_OBJECT_WIDTH:
+        raise ValueError(f"too wide: {text}; allowed is a width up to {MAX_OBJECT_WIDTH:g} m")
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

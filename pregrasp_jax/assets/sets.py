@@ -1,0 +1,58 @@
+"""The object set of a run, wherever it comes from, and the table that shows it."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from pregrasp_jax.assets.bank import ineligibility
+from pregrasp_jax.assets.catalogue import builtin_bank
+from pregrasp_jax.assets.meshes import Progress, Refusal, load_object_dir
+from pregrasp_jax.types import HullBank
+
+MIN_OBJECTS = 5
+"""The smallest scene has five objects, all different."""
+
+
+def load_bank_for(object_dir: str | Path | None, object_set: str, *, progress: Progress | None = None) -> HullBank:
+    """Return the built-in objects, or those of a folder; refused meshes are warnings.
+
+    Args:
+        object_dir: folder of meshes, None for the built-in catalogue.
+        object_set: `seen` or `unseen`.
+        progress: called as (done, total, file name) after every mesh.
+
+    Raises:
+        ValueError: there is no such set, or it is too small to make scenes of.
+    """
+    if object_dir is None:
+        return builtin_bank(object_set)
+    bank, refusals = load_object_dir(Path(object_dir), object_set, progress=progress)
+    for refusal in refusals:
+        warnings.warn(f"{object_dir}: {refusal.name} refused: {refusal.reason}", stacklevel=2)
+    targets = int(np.sum(bank.eligible))
+    if len(bank.names) < MIN_OBJECTS or targets == 0:
+        raise ValueError(
+            f"{object_dir}: {len(bank.names)} usable '{object_set}' objects of which {targets} can be targets "
+            f"({len(refusals)} refused); allowed are at least {MIN_OBJECTS} objects and 1 target"
+        )
+    return bank
+
+
+def format_table(bank: HullBank, refusals: list[Refusal]) -> str:
+    """Return a text table of the objects (hulls, size w x d x h, mass, target or why not) and of the refusals."""
+    header = ("object", "hulls", "size [mm]", "mass [kg]", "target")
+    rows = [header, *(_row(bank, index) for index in range(len(bank.names)))]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(header))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines.append(f"{len(bank.names)} objects, {int(np.sum(bank.eligible))} can be targets, {len(refusals)} refused")
+    lines += [f"refused: {refusal.name}: {refusal.reason}" for refusal in refusals]
+    return "\n".join(lines)
+
+
+def _row(bank: HullBank, index: int) -> tuple[str, ...]:
+    ids = np.asarray(bank.object_hulls[index])
+    points = np.asarray(bank.full.vertices)[ids[ids >= 0]].reshape(-1, 3)
+    size = " x ".join(f"{extent * 1e3:.0f}" for extent in np.ptp(points, axis=0))
+    target = "yes" if bank.eligible[index] else f"no: {ineligibility(bank, index)}"
+    return bank.names[index], str(int((ids >= 0).sum())), size, f"{float(bank.mass[index]):.3f}", target

@@ -1,0 +1,94 @@
+"""`objects.yaml`: what a mesh file cannot say about itself.
+
+The file lies beside the meshes. Its keys are mesh file names, and `defaults` for all of them::
+
+    defaults: {density: 300, friction: 0.25}
+    mug.stl: {scale: 0.001, up: y, mass: 0.12}
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pregrasp_jax.assets.bank import DEFAULT_DENSITY, DEFAULT_FRICTION
+
+SETTINGS_FILE = "objects.yaml"
+
+UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
+
+_RANGES = {"scale": (1e-6, 1e6), "mass": (0.005, 20.0), "density": (10.0, 20_000.0), "friction": (0.01, 5.0)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectSettings:
+    """Settings of one mesh."""
+
+    scale: float = 1.0
+    """Metres per unit of the file; 0.001 for millimetres."""
+    up: str = "z"
+    """The axis of the file that points up when the object stands: x, y, z, -x, -y or -z."""
+    mass: float | None = None
+    """kg; None is `density` times the volume of the hulls."""
+    density: float = DEFAULT_DENSITY
+    """kg/m^3, used where there is no mass."""
+    friction: float = DEFAULT_FRICTION
+    """Sliding friction against other objects."""
+
+
+def load_settings(folder: Path) -> tuple[ObjectSettings, dict[str, ObjectSettings]]:
+    """Read `objects.yaml` of a folder, if there is one.
+
+    Returns:
+        The settings of unlisted meshes, and those of every listed file by name.
+
+    Raises:
+        ValueError: the file is not YAML, or holds an unknown setting or a value out of range.
+    """
+    path = folder / SETTINGS_FILE
+    if not path.is_file():
+        return ObjectSettings(), {}
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
+    content = _mapping(content, str(path))
+    shared = _checked(content.pop("defaults", None), f"{path}: defaults")
+    listed = {str(name): _merged(shared, _checked(entry, f"{path}: {name}")) for name, entry in content.items()}
+    return ObjectSettings(**shared), {name: ObjectSettings(**entry) for name, entry in listed.items()}
+
+
+def _merged(shared: dict[str, Any], entry: dict[str, Any]) -> dict[str, Any]:
+    """Let an entry override the defaults; its density also overrides a default mass."""
+    return {**shared, **({"mass": None} if "density" in entry else {}), **entry}
+
+
+def _checked(entry: Any, where: str) -> dict[str, Any]:
+    """Return a copy of one entry whose keys and values are all allowed."""
+    entry = _mapping(entry, where)
+    allowed = [field.name for field in fields(ObjectSettings)]
+    for key, value in entry.items():
+        if key not in allowed:
+            raise ValueError(f"{where}: unknown setting '{key}'; allowed are {', '.join(allowed)}")
+        if key == "up":
+            if value not in UP_AXES:
+                raise ValueError(f"{where}: up is {value!r}; allowed are {', '.join(UP_AXES)}")
+            continue
+        low, high = _RANGES[key]
+        number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if not number or not low <= value <= high:
+            raise ValueError(f"{where}: {key} is {value!r}; allowed is a number from {low:g} to {high:g}")
+    if {"mass", "density"} <= entry.keys():
+        raise ValueError(f"{where}: has both mass and density; allowed is one of them")
+    return entry
+
+
+def _mapping(value: Any, where: str) -> dict[str, Any]:
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{where}: is {type(value).__name__}; allowed is a mapping of names to settings")
+    return dict(value)

@@ -1,0 +1,309 @@
+"""Folders of meshes: what loads, what is refused and why, settings, cache, and the table."""
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from trimesh.exchange.obj import export_obj
+
+from pregrasp_jax.assets import meshes
+from pregrasp_jax.assets.catalogue import builtin_bank
+from pregrasp_jax.assets.decompose import BASE_BAND, decompose, flatten_base, repair
+from pregrasp_jax.assets.hulls import volume
+from pregrasp_jax.assets.meshes import Refusal, load_mesh, load_object_dir
+from pregrasp_jax.assets.sets import format_table, load_bank_for
+from pregrasp_jax.assets.settings import ObjectSettings, load_settings
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("PREGRASP_JAX_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "hulls"
+
+
+def write(path: Path, mesh: trimesh.Trimesh) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mesh.export(path)
+
+
+def box(width: float = 0.06, depth: float = 0.07, height: float = 0.15) -> trimesh.Trimesh:
+    return trimesh.creation.box((width, depth, height))
+
+
+def bottle() -> trimesh.Trimesh:
+    """Non-convex, one closed surface: wide below, narrow above."""
+    return trimesh.creation.revolve([[0, 0], [0.04, 0], [0.04, 0.1], [0.012, 0.1], [0.012, 0.2], [0, 0.2]])
+
+
+def crash_on_bad(job):
+    """A worker in which native code dies on one mesh; at module level, so that it can be sent to a process."""
+    if job.name == "bad":
+        os._exit(1)
+    return try_job(job)
+
+
+try_job = meshes._try_job
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory):
+    """A folder of good and bad meshes, loaded once."""
+    folder = tmp_path_factory.mktemp("mixed")
+    write(folder / "a_box.stl", box())
+    write(folder / "b_bottle.ply", bottle())
+    write(folder / "c_millimetres.obj", box(70, 150, 60))  # lies along y
+    write(folder / "d_scene.glb", box(0.05, 0.05, 0.2))
+    write(folder / "e_twin.stl", box(0.05, 0.06, 0.12))
+    write(folder / "e_twin.obj", box(0.06, 0.06, 0.12))
+    bad = {
+        "flat.stl": box(0.05, 0.004, 0.15),
+        "huge.stl": box(60, 70, 150),
+        "low.stl": box(0.06, 0.06, 0.09),
+        "slanted.stl": box(0.03, 0.03, 0.28),
+        "tall.stl": box(0.08, 0.08, 0.31),
+        "tiny.stl": box(6e-5, 7e-5, 15e-5),
+        "wide.stl": box(0.21, 0.05, 0.15),
+    }
+    bad["slanted.stl"].vertices[:, 0] += 0.6 * (np.asarray(bad["slanted.stl"].vertices)[:, 2])
+    for name, mesh in bad.items():
+        write(folder / name, mesh)
+    obj = export_obj(box())
+    (folder / "nan.obj").write_text(obj.replace("v ", "v nan 0 0\nv ", 1).replace("f 1", "f 9", 1))
+    (folder / "empty.ply").write_bytes(b"")
+    (folder / "points.obj").write_text("v 0 0 0\nv 0 0 0.2\nv 0.1 0 0\n")
+    (folder / "sheet.obj").write_text("v 0 0 0\nv 0.1 0.1 0\nv 0.05 0.05 0.2\nf 1 2 3\n")
+    (folder / "noise.stl").write_bytes(bytes(range(256)) * 4)
+    (folder / "folder.obj").mkdir()
+    outside = tmp_path_factory.mktemp("outside") / "x.stl"
+    write(outside, box())
+    (folder / "link.stl").symlink_to(outside)
+    (folder / "dangling.stl").symlink_to(folder / "nothing.stl")
+    (folder / "notes.txt").write_text("not a mesh")
+    (folder / "objects.yaml").write_text(
+        "defaults: {density: 400, friction: 0.3}\n"
+        "a_box.stl: {mass: 0.33}\n"
+        "c_millimetres.obj: {scale: 0.001, up: y}\n"
+        "gone.stl: {mass: 0.1}\n"
+        "../outside/x.stl: {mass: 0.1}\n"
+    )
+    calls: list[tuple[int, int, str]] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PREGRASP_JAX_CACHE", str(tmp_path_factory.mktemp("cache")))
+        bank, refusals = load_object_dir(folder, "seen", progress=lambda *call: calls.append(call))
+    return bank, {r.name: r.reason for r in refusals}, calls
+
+
+REASONS = {
+    "flat.stl": "flat: 50 x 4 x 150 mm; allowed is at least 10 mm",
+    "huge.stl": "wrong unit: 6e+04 x 7e+04 x 1.5e+05 mm, allowed are 0.01 to 1 m; set scale: 0.001",
+    "low.stl": "too low: 60 x 60 x 90 mm, up is z; allowed heights are 0.11 to 0.3 m",
+    "slanted.stl": "does not stand: tips over at",
+    "tall.stl": "too tall: 80 x 80 x 310 mm",
+    "tiny.stl": "set scale: 1000 if the file is in kilometres",
+    "wide.stl": "too wide: 210 x 50 x 150 mm; allowed is a width up to 0.2 m",
+    "nan.obj": "vertices are NaN or infinite; allowed are finite",
+    "empty.ply": "not a readable .ply file",
+    "points.obj": "no faces",
+    "sheet.obj": "encloses no volume",
+    "noise.stl": "not a readable .stl file",
+    "folder.obj": "missing or not a file",
+    "link.stl": "link that leads out of the folder",
+    "dangling.stl": "missing or not a file",
+    "gone.stl": "listed in objects.yaml but missing",
+    "../outside/x.stl": "listed in objects.yaml but leads out of the folder",
+}
+
+
+def test_good_meshes_load_beside_bad_ones(mixed):
+    bank, reasons, calls = mixed
+    assert bank.names == ("a_box", "b_bottle", "c_millimetres", "d_scene", "e_twin.obj", "e_twin.stl")
+    assert set(reasons) == set(REASONS)
+    assert [done for done, _, _ in calls] == sorted(done for done, _, _ in calls)
+    assert calls[-1][:2] == (len(bank.names) + len(reasons),) * 2
+
+
+@pytest.mark.parametrize("name", REASONS)
+def test_every_refusal_says_what_is_wrong_and_what_is_allowed(mixed, name):
+    _, reasons, _ = mixed
+    assert REASONS[name] in reasons[name]
+    assert "\n" not in reasons[name]
+
+
+def test_settings_reach_the_objects(mixed):
+    bank, _, _ = mixed
+    assert float(bank.mass[0]) == pytest.approx(0.33)
+    np.testing.assert_allclose(bank.friction, 0.3)
+    assert float(bank.mass[3]) == pytest.approx(400 * 0.05 * 0.05 * 0.2, rel=3e-3)
+    # Millimetres along y: standing up it is 60 x 70 mm and 150 mm tall, as a proper rotation, not a swap.
+    extent = np.ptp(np.asarray(bank.full.vertices)[np.asarray(bank.object_hulls)[2, 0]], axis=0)
+    np.testing.assert_allclose(extent, [0.06, 0.07, 0.15], atol=1e-6)
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
+def test_up_axis_is_a_proper_rotation(tmp_path, up):
+    """A chiral solid keeps its volume's sign, and its tip (along the up axis) ends on top."""
+    sign, axis = -1.0 if up.startswith("-") else 1.0, "xyz".index(up[-1])
+    tip = np.roll([0.15, 0.0, 0.0], axis) * sign
+    a, b, c = np.roll([0.0, 0.06, 0.0], axis), np.roll([0.0, 0.0, 0.06], axis), np.roll([0.0, -0.03, -0.03], axis)
+    mesh = trimesh.Trimesh([tip, a, b, c], [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+    mesh.export(tmp_path / "m.ply")
+    turned = meshes._upright(np.asarray(mesh.vertices), up)
+    np.testing.assert_allclose(turned[0], [0.0, 0.0, 0.15], atol=1e-9)
+    assert np.linalg.det(turned[1:] - turned[0]) == pytest.approx(np.linalg.det(mesh.vertices[1:] - mesh.vertices[0]))
+    assert load_mesh(tmp_path / "m.ply", ObjectSettings(up=up)).bounds[1, 2] == pytest.approx(0.15)
+
+
+def test_cache_is_used_and_depends_on_content_settings_and_health(tmp_path, cache, monkeypatch):
+    folder = tmp_path / "set"
+    write(folder / "one.stl", box())
+    first, _ = load_object_dir(folder, "seen")
+    (entry,) = cache.iterdir()
+    with monkeypatch.context() as patch:
+        patch.setattr(meshes, "ProcessPoolExecutor", None)  # a second decomposition would fail
+        again, _ = load_object_dir(folder, "seen")
+    assert again.content_hash == first.content_hash
+    entry.write_bytes(entry.read_bytes()[:-200])
+    assert load_object_dir(folder, "seen")[0].content_hash == first.content_hash
+    (folder / "objects.yaml").write_text("one.stl: {mass: 0.4}")
+    assert float(load_object_dir(folder, "seen")[0].mass[0]) == pytest.approx(0.4)
+    assert len(list(cache.iterdir())) == 2
+
+
+def test_a_crashing_decomposition_costs_one_mesh(tmp_path, monkeypatch):
+    for name in ("bad", "good", "other"):
+        write(tmp_path / f"{name}.stl", box())
+    monkeypatch.setattr(meshes, "_try_job", crash_on_bad)
+    bank, refusals = load_object_dir(tmp_path, "seen")
+    assert bank.names == ("good", "other")
+    assert [r.name for r in refusals] == ["bad.stl"]
+    assert "worker process died" in refusals[0].reason
+
+
+def test_sets_and_folders(tmp_path):
+    with pytest.raises(ValueError, match="no such folder"):
+        load_object_dir(tmp_path / "absent", "seen")
+    with pytest.raises(ValueError, match="holds no mesh; allowed are"):
+        load_object_dir(tmp_path, "seen")
+    with pytest.raises(ValueError, match="has no 'unseen' set; allowed here are seen"):
+        load_object_dir(tmp_path, "unseen")
+    with pytest.raises(ValueError, match="'train' is unknown; allowed are seen, unseen"):
+        load_object_dir(tmp_path, "train")
+    (tmp_path / "unseen").mkdir()
+    with pytest.raises(ValueError, match="has no 'seen' set; allowed here are unseen"):
+        load_object_dir(tmp_path, "seen")
+    assert meshes.mesh_folder(tmp_path, "unseen") == tmp_path / "unseen"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a.stl: {colour: red}", "unknown setting 'colour'; allowed are scale, up, mass, density, friction"),
+        ("a.stl: {up: w}", "up is 'w'; allowed are x, y, z, -x, -y, -z"),
+        ("a.stl: {mass: true}", "mass is True; allowed is a number from 0.005 to 20"),
+        ("defaults: {scale: -1}", "defaults: scale is -1; allowed is"),
+        ("a.stl: {density: .nan}", "density is nan"),
+        ("a.stl: {mass: 1, density: 300}", "both mass and density"),
+        ("a.stl: [1, 2]", "is list; allowed is a mapping"),
+        ("- a", "is list; allowed is a mapping"),
+        ("a: {b", "not valid YAML"),
+        ("a.stl: !!python/object/apply:os.getcwd []", "not valid YAML"),
+    ],
+)
+def test_wrong_settings_are_one_line(tmp_path, text, message):
+    (tmp_path / "objects.yaml").write_text(text)
+    with pytest.raises(ValueError) as error:
+        load_settings(tmp_path)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_density_overrides_a_default_mass(tmp_path):
+    (tmp_path / "objects.yaml").write_text("defaults: {mass: 0.2}\na.stl: {density: 700}\nb.stl:\n")
+    defaults, listed = load_settings(tmp_path)
+    assert (defaults.mass, listed["b.stl"].mass) == (0.2, 0.2)
+    assert (listed["a.stl"].mass, listed["a.stl"].density) == (None, 700)
+
+
+def test_too_small_a_set_is_refused(tmp_path):
+    write(tmp_path / "one.stl", box())
+    write(tmp_path / "two.stl", box(0.06, 0.06, 0.05))
+    with (
+        pytest.warns(UserWarning, match=r"two\.stl refused: too low"),
+        pytest.raises(ValueError, match=r"1 usable 'seen' objects .* at least 5 objects and 1 target"),
+    ):
+        load_bank_for(tmp_path, "seen")
+    assert load_bank_for(None, "unseen").content_hash == builtin_bank("unseen").content_hash
+
+
+def test_table_names_objects_and_refusals():
+    bank = builtin_bank("seen")
+    table = format_table(bank, [Refusal("x.stl", "too low")]).splitlines()
+    assert table[0].split() == ["object", "hulls", "size", "[mm]", "mass", "[kg]", "target"]
+    chips = next(line for line in table if line.startswith("ycb_chips_can"))
+    assert chips.split()[1:] == ["1", "77", "x", "77", "x", "250", "0.205", "yes"]
+    pitcher = next(line for line in table if line.startswith("ycb_pitcher"))
+    assert "no: narrowest width" in pitcher
+    assert table[-2].startswith("17 objects, ")
+    assert table[-1] == "refused: x.stl: too low"
+
+
+def test_repair_merges_seams_fills_holes_and_turns_inside_out_faces():
+    mesh = bottle()
+    soup = trimesh.Trimesh(
+        mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3)[1:], process=False
+    )
+    soup.faces[::2] = soup.faces[::2, ::-1]
+    mended = repair(soup)
+    assert mended.is_watertight
+    assert mended.volume == pytest.approx(mesh.volume, rel=1e-6)
+
+
+def test_large_meshes_are_decimated():
+    mesh = trimesh.creation.icosphere(subdivisions=6, radius=0.08)
+    mended = repair(mesh)
+    assert 5000 < len(mended.faces) < 25_000 < len(mesh.faces)
+    assert mended.convex_hull.volume == pytest.approx(mesh.volume, rel=1e-3)
+
+
+def test_decomposition_is_deterministic_tight_and_flat():
+    mesh = bottle()
+    first, second = decompose(mesh), decompose(mesh)
+    assert 2 <= len(first) <= 6
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert sum(volume(part) for part in first) == pytest.approx(mesh.volume, rel=0.08)
+    assert volume(np.asarray(mesh.vertices)) > 1.3 * mesh.volume  # one hull would be the decoy
+    assert min(part[:, 2].min() for part in first) == 0.0
+
+
+def test_open_meshes_are_refitted_to_their_surface():
+    """Remeshing inflates; with the refit nothing sticks out of the mesh's own bounding box."""
+    mesh = bottle()
+    torn = trimesh.Trimesh(mesh.vertices, np.delete(mesh.faces, [5, 6, 7, 8, 60, 61, 62, 63], axis=0), process=False)
+    assert not torn.is_watertight
+    points = np.concatenate(decompose(torn))
+    assert points[:, :2].max() <= 0.04 + 1e-9
+    assert points[:, 2].max() <= 0.2 + 1e-9
+
+
+def test_flatten_base_moves_only_the_band():
+    part = np.array(
+        [[0.0, 0.0, 0.5], [0.1, 0.0, 0.5 + 0.9 * BASE_BAND], [0.0, 0.1, 0.5 + 1.1 * BASE_BAND], [0, 0, 0.7]]
+    )
+    (flat,) = flatten_base([part])
+    np.testing.assert_allclose(flat[:, 2], [0.0, 0.0, 1.1 * BASE_BAND, 0.2])
+    np.testing.assert_array_equal(flat[:, :2], part[:, :2])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("PREGRASP_JAX_OBJECTS" not in os.environ, reason="PREGRASP_JAX_OBJECTS names no folder of meshes")
+def test_a_folder_of_real_meshes(tmp_path):
+    folder = meshes.mesh_folder(Path(os.environ["PREGRASP_JAX_OBJECTS"]), "seen")
+    shutil.copytree(folder, tmp_path / "seen")
+    bank, refusals = load_object_dir(tmp_path, "seen")
+    assert not refusals
+    assert np.asarray(bank.eligible).mean() > 0.8
+    assert min(meshes.tip_angle(bank, i) for i in range(len(bank.names))) > meshes.MIN_TIP_ANGLE
