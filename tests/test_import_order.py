@@ -9,7 +9,7 @@ import pregrasp_jax
 
 PACKAGE = Path(pregrasp_jax.__file__).parent
 ORDER = [
-    ["io", "types"],
+    ["command_line", "io", "machine", "types"],
     ["config", "geometry", "grid", "judge"],
     ["assets"],
     ["robot"],
@@ -25,7 +25,8 @@ ORDER = [
     ["checkpoint"],
     ["training"],
     ["report"],
-    ["cli", "__main__"],
+    ["cli"],
+    ["__main__"],
 ]
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
 
