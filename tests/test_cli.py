@@ -16,7 +16,7 @@ from PIL import Image
 
 from pregrasp_jax import __main__ as main_module
 from pregrasp_jax.checkpoint import save_policy
-from pregrasp_jax.cli import commands, doctor, player, progress
+from pregrasp_jax.cli import commands, doctor, film, player, progress
 from pregrasp_jax.cli.evaluate import refuse_unwritable
 from pregrasp_jax.cli.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.config import PRESETS, AssetsConfig, Config, PhysicsConfig, SceneConfig, TaskConfig
@@ -180,8 +180,24 @@ def test_pretrained_is_a_policy_or_a_clear_refusal(fake_world: list[Config]) -> 
             make_player(EvaluationConfig(policy="pretrained"))
 
 
+def test_a_film_shows_the_episodes_that_are_counted(fake_world: list[Config]) -> None:
+    request = EvaluationConfig(policy="random", episodes=6, seed=5)
+    made = make_player(request)
+    rows = run_evaluation(request, made)["rows"]
+    play = film.make_play(made, seed=5)
+    for row in rows:
+        *pushes, last = play(row["scene"])
+        assert all(decision.ending == "" for decision in pushes) and last.action is None
+        assert int(last.state.num_pushes) == row["motions"]
+        reason = row["reason"].replace("grasp_failed", "target_in_region, grasp failed")
+        assert last.ending == (f"{reason}, grasped" if row["success"] else reason)
+
+
 def test_progress_line() -> None:
-    assert progress.describe(25, 100, 20, 60.0) == "episode 25 of 100 | success 80 % | left 3:00"
+    assert progress.describe(25, 100, 20, 180.0) == "episode 25 of 100 | success 80 % | left 0:03:00"
+    # 20 episodes in 60 s since the first report; the 40 s of compilation before it do not count.
+    assert progress.time_left(100.0, 25, 100, (40.0, 5)) == 60.0 * 75 / 20
+    assert progress.time_left(40.0, 5, 100, (40.0, 5)) is None
 
 
 def test_plain_progress_ends_with_a_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -190,7 +206,7 @@ def test_plain_progress_ends_with_a_line(capsys: pytest.CaptureFixture[str]) -> 
             report(done, 4, done)
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert captured.err == "episode 4 of 4 | success 100 % | left 0:00\n"
+    assert captured.err == "episode 4 of 4 | success 100 % | left 0:00:00\n"
 
 
 def _evaluation_file(path: Path, policy: str, successes: list[int], **changes: Any) -> str:

@@ -4,7 +4,7 @@ import collections
 import itertools
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw
 from pregrasp_jax import drawing, grid
 from pregrasp_jax.cli.player import Player
 from pregrasp_jax.env import Env
+from pregrasp_jax.evaluation.runner import MIN_BATCH
 from pregrasp_jax.heightmap import scene_hulls
 from pregrasp_jax.judge import TARGET_IN_REGION
 from pregrasp_jax.types import OPEN, REASONS, EnvState
@@ -72,10 +73,10 @@ def draw_scenes(env: Env, indices: Iterable[int]) -> np.ndarray:
 def make_play(player: Player, seed: int) -> Callable[[int], Iterator[Decision]]:
     """Return the function scene -> its decisions, one at a time, the last of which is the end of the episode.
 
-    Keys are those of `evaluation.Evaluator`, so what is drawn is what was counted.
+    Keys and rounding are those of `evaluation.Evaluator`, so what is drawn is what was counted.
     """
     env = player.env
-    reset, step, decide, grasp = (jax.jit(f) for f in (env.reset_to, env.step, player.policy, env.grasp))
+    reset, step, decide, grasp = (_in_batch(f) for f in (env.reset_to, env.step, player.policy, env.grasp))
 
     def play(scene: int) -> Iterator[Decision]:
         state = reset(jnp.int32(scene))
@@ -92,6 +93,17 @@ def make_play(player: Player, seed: int) -> Callable[[int], Iterator[Decision]]:
         yield Decision(state, None, ending)
 
     return play
+
+
+def _in_batch(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the compiled function of one scene that rounds as in a batch (see `evaluation.runner.MIN_BATCH`)."""
+    batched = jax.jit(jax.vmap(function))
+
+    def call(*args: Any) -> Any:
+        copies = jax.tree.map(lambda leaf: jnp.stack([leaf] * MIN_BATCH), args)
+        return jax.tree.map(lambda leaf: leaf[0], batched(*copies))
+
+    return call
 
 
 def draw_panel(player: Player, decision: Decision) -> np.ndarray:

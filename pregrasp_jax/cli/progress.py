@@ -8,6 +8,8 @@ from typing import TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from pregrasp_jax.training.console import format_time
+
 PLAIN_INTERVAL = 10.0
 """s between plain lines."""
 
@@ -31,7 +33,8 @@ class EpisodeProgress:
             transient=True,
         )
         self._task = self._progress.add_task("compiling", total=1.0)
-        self._start = self._last_line = time.monotonic()
+        self._last_line = time.monotonic()
+        self._first: tuple[float, int] | None = None
 
     def __enter__(self) -> "EpisodeProgress":
         """Show the bar."""
@@ -51,14 +54,21 @@ class EpisodeProgress:
     def __call__(self, done: int, total: int, successes: int) -> None:
         """Report that `done` of `total` episodes have ended, `successes` of them well."""
         now = time.monotonic()
-        text = describe(done, total, successes, now - self._start)
+        # Timed from the first report, so that compilation is not mistaken for slow episodes.
+        self._first = self._first or (now, done)
+        text = describe(done, total, successes, time_left(now, done, total, self._first))
         self._progress.update(self._task, completed=done / total, description=text)
         if not self._console.is_terminal and (done == total or now - self._last_line >= PLAIN_INTERVAL):
             self._last_line = now
             self.say(text)
 
 
-def describe(done: int, total: int, successes: int, seconds: float) -> str:
-    """Return one line; the time left assumes that the remaining episodes are like the ones so far."""
-    left = round(seconds * (total - done) / done)
-    return f"episode {done} of {total} | success {100 * successes / done:.0f} % | left {left // 60}:{left % 60:02d}"
+def time_left(now: float, done: int, total: int, first: tuple[float, int]) -> float | None:
+    """Return the s left if episodes go on like those since the `first` (time, done); None if there are none."""
+    start, done_before = first
+    return None if done == done_before else (now - start) * (total - done) / (done - done_before)
+
+
+def describe(done: int, total: int, successes: int, left: float | None) -> str:
+    """Return one line; `left` in s."""
+    return f"episode {done} of {total} | success {100 * successes / done:.0f} % | left {format_time(left)}"
