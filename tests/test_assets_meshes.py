@@ -9,11 +9,12 @@ import pytest
 import trimesh
 from trimesh.exchange.obj import export_obj
 
-from pregrasp_jax.assets import meshes
+from pregrasp_jax.assets import mesh_file, meshes
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.decompose import BASE_BAND, decompose, flatten_base, repair
 from pregrasp_jax.assets.hulls import volume
-from pregrasp_jax.assets.meshes import Refusal, load_mesh, load_object_dir
+from pregrasp_jax.assets.mesh_file import load_mesh
+from pregrasp_jax.assets.meshes import Refusal, load_object_dir
 from pregrasp_jax.assets.sets import format_table, load_bank_for
 from pregrasp_jax.assets.settings import ObjectSettings, load_settings
 
@@ -150,7 +151,7 @@ def test_up_axis_is_a_proper_rotation(tmp_path, up):
     a, b, c = np.roll([0.0, 0.06, 0.0], axis), np.roll([0.0, 0.0, 0.06], axis), np.roll([0.0, -0.03, -0.03], axis)
     mesh = trimesh.Trimesh([tip, a, b, c], [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
     mesh.export(tmp_path / "m.ply")
-    turned = meshes._upright(np.asarray(mesh.vertices), up)
+    turned = mesh_file._upright(np.asarray(mesh.vertices), up)
     np.testing.assert_allclose(turned[0], [0.0, 0.0, 0.15], atol=1e-9)
     assert np.linalg.det(turned[1:] - turned[0]) == pytest.approx(np.linalg.det(mesh.vertices[1:] - mesh.vertices[0]))
     assert load_mesh(tmp_path / "m.ply", ObjectSettings(up=up)).bounds[1, 2] == pytest.approx(0.15)

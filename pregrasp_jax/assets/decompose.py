@@ -20,7 +20,7 @@ BASE_BAND = 0.004
 to 0.13 rad, or fall by themselves."""
 
 MAX_FACES = 20_000
-"""Meshes with more faces are decimated to this many; a scan of a household object loses less than 0.1 mm."""
+"""Meshes with more faces are decimated to this many, far finer than hulls of 32 vertices can show."""
 
 _CONVEX_RATIO = {True: 1.06, False: 1.1}
 """A mesh whose convex hull is at most this much larger is one hull; by whether the mesh is closed, because the
@@ -41,7 +41,8 @@ _COACD = {
     "preprocess_resolution": 20,
     "seed": 0,
 }
-"""Coarser than CoACD's defaults, three times as fast; on the paper's meshes the volumes differ by under 1 %."""
+"""Coarser than CoACD's defaults, several times as fast. On 14 real scans the union of the simplified hulls has 0.91 to
+1.04 times the volume of the mesh (1.12 where the scan has an inner wall)."""
 
 
 def repair(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

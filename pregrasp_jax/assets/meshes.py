@@ -3,7 +3,6 @@
 One bad mesh never stops the rest: it becomes a `Refusal`, one line that names what is wrong and what is allowed.
 """
 
-import io as memory
 import logging
 import multiprocessing
 from collections.abc import Callable, Sequence
@@ -11,45 +10,25 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import trimesh
 from scipy.spatial import ConvexHull
 
 from pregrasp_jax import io
 from pregrasp_jax.assets import decompose
 from pregrasp_jax.assets.bank import FORMAT, ConvexObject, concatenate, load_bank, make_bank, save_bank
+from pregrasp_jax.assets.mesh_file import MAX_BYTES, SUFFIXES, load_mesh, one_line
 from pregrasp_jax.assets.settings import SETTINGS_FILE, UP_AXES, ObjectSettings, load_settings
-from pregrasp_jax.grid import MAX_HEIGHT
 from pregrasp_jax.types import HullBank
 
 Progress = Callable[[int, int, str], object]
 """Called as (done, total, file name) in the calling process."""
 
-SUFFIXES = (".obj", ".stl", ".ply", ".glb")
-
-MIN_OBJECT_HEIGHT = 0.11
-"""m; the hand pushes at 0.1 m, lower objects would pass under it."""
-
-MAX_OBJECT_HEIGHT = MAX_HEIGHT
-"""m; heightmaps end there."""
-
-MAX_OBJECT_WIDTH = 0.2
-"""m; wider objects leave no room in the 0.5 m workspace."""
-
-MIN_OBJECT_WIDTH = 0.01
-"""m; thinner objects are flat."""
-
 MIN_TIP_ANGLE = 0.05
 """rad by which the centre of mass must lie inside the base, seen from the centre of mass."""
 
-MAX_BYTES = 256 * 2**20
-"""Largest mesh file; 2 M faces are 100 MB of binary STL."""
-
 _WORKERS = 2
-
-_UNITS = (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254), ("kilometres", 1e3))
 
 
 class Refusal(NamedTuple):
@@ -122,30 +101,6 @@ def mesh_folder(object_dir: Path, object_set: str) -> Path:
     if present or object_set != "seen":
         raise ValueError(f"{object_dir}: has no '{object_set}' set; allowed here are {', '.join(present or ['seen'])}")
     return object_dir
-
-
-def load_mesh(path: Path, settings: ObjectSettings) -> trimesh.Trimesh:
-    """Read one mesh file, check it, and return it repaired, in metres, z up.
-
-    Raises:
-        ValueError: one line about what is wrong with it.
-    """
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise ValueError(f"file of {size / 2**20:.0f} MB; allowed are {MAX_BYTES // 2**20} MB, decimate it first")
-    mesh = _parse(path.read_bytes(), path.suffix[1:].lower())
-    if len(mesh.faces) == 0:
-        raise ValueError(f"empty: {len(mesh.vertices)} vertices and no faces; allowed is a triangle mesh")
-    used = np.asarray(mesh.vertices, np.float64)[np.unique(mesh.faces)]
-    bad = int((~np.isfinite(used).all(axis=1)).sum())
-    if bad:
-        raise ValueError(f"{bad} of {len(used)} vertices are NaN or infinite; allowed are finite coordinates")
-    mesh.vertices = _upright(np.asarray(mesh.vertices, np.float64) * settings.scale, settings.up)
-    _check_size(_upright(used * settings.scale, settings.up), settings)
-    mesh = decompose.repair(mesh)
-    if len(mesh.faces) == 0:
-        raise ValueError("all faces are degenerate or duplicates; allowed is a surface that encloses a volume")
-    return mesh
 
 
 def make_object(name: str, path: Path, settings: ObjectSettings) -> ConvexObject:
@@ -252,7 +207,7 @@ def _try_job(job: _Job) -> ConvexObject | str:
     try:
         return make_object(job.name, job.path, job.settings)
     except Exception as error:
-        return _one_line(error)
+        return one_line(error)
 
 
 def _finish(item: ConvexObject) -> HullBank | str:
@@ -260,7 +215,7 @@ def _finish(item: ConvexObject) -> HullBank | str:
     try:
         bank = make_bank([item])
     except ValueError as error:
-        return _one_line(error)
+        return one_line(error)
     angle = tip_angle(bank, 0)
     if angle < MIN_TIP_ANGLE:
         return (
@@ -268,46 +223,3 @@ def _finish(item: ConvexObject) -> HullBank | str:
             f"another up axis ({', '.join(UP_AXES)}) can be set in {SETTINGS_FILE}"
         )
     return bank
-
-
-def _parse(data: bytes, file_type: str) -> trimesh.Trimesh:
-    """Parse from memory, without a resolver: a mesh file cannot make us open another file."""
-    options: dict[str, Any] = {"skip_materials": True} if file_type == "obj" else {}
-    try:
-        scene = trimesh.load_scene(memory.BytesIO(data), file_type=file_type, process=False, **options)
-        mesh = scene.to_mesh()
-    except Exception as error:
-        raise ValueError(f"not a readable .{file_type} file: {_one_line(error)}") from error
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-
-
-def _upright(vertices: np.ndarray, up: str) -> np.ndarray:
-    """Rotate vertices so that the axis `up` becomes z: cyclic for the axis, half a turn about x for its sign."""
-    vertices = np.roll(vertices, 2 - "xyz".index(up[-1]), axis=1)
-    return vertices * [1.0, -1.0, -1.0] if up.startswith("-") else vertices
-
-
-def _check_size(vertices: np.ndarray, settings: ObjectSettings) -> None:
-    """Refuse wrong units, flat objects, and objects outside of what the task can handle."""
-    size = np.ptp(vertices, axis=0)
-    text = " x ".join(f"{extent * 1e3:.4g}" for extent in size) + " mm"
-    if size.max() > 1.0 or size.max() < 0.01:
-        hint = ", ".join(
-            f"scale: {unit * settings.scale:g} if the file is in {name}"
-            for name, unit in _UNITS
-            if MIN_OBJECT_HEIGHT / 2 <= size.max() * unit <= 2 * MAX_OBJECT_HEIGHT
-        )
-        hint = hint or f"a scale that makes it {MIN_OBJECT_HEIGHT:g} to {MAX_OBJECT_HEIGHT:g} m tall"
-        raise ValueError(f"wrong unit: {text}, allowed are 0.01 to 1 m; set {hint} in {SETTINGS_FILE}")
-    if size.min() < MIN_OBJECT_WIDTH:
-        raise ValueError(f"flat: {text}; allowed is at least {MIN_OBJECT_WIDTH * 1e3:g} mm in every direction")
-    if not MIN_OBJECT_HEIGHT <= size[2] <= MAX_OBJECT_HEIGHT:
-        what = "too low" if size[2] < MIN_OBJECT_HEIGHT else "too tall"
-        allowed = f"allowed heights are {MIN_OBJECT_HEIGHT:g} to {MAX_OBJECT_HEIGHT:g} m"
-        raise ValueError(f"{what}: {text}, up is {settings.up}; {allowed}, scale and up can be set in {SETTINGS_FILE}")
-    if size[:2].max() > MAX_OBJECT_WIDTH:
-        raise ValueError(f"too wide: {text}; allowed is a width up to {MAX_OBJECT_WIDTH:g} m")
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
