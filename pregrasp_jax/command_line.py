@@ -30,9 +30,12 @@ def parse(parser: Callable[[], T]) -> T:
 
 
 def unbox(text: str) -> str:
-    """Return what a tyro error box says, without its frame, suggestions of other commands and help."""
-    lines = [line.strip().strip("│╭╮╰╯─ ").strip() for line in text.splitlines()]
-    sections = [section for section in _split(lines) if section]
+    """Return what a tyro error box (of lines, or of dashes where the encoding is poor) says, in one line.
+
+    The frame, the title and the help text go; of suggestions, the first stays.
+    """
+    lines = [line.strip("│╭╮╰╯─ ") for line in text.splitlines()]
+    sections = _sections([line if line.strip("-") else "" for line in lines])
     message = " ".join(sections[0]) if sections else "the arguments cannot be read"
     offers = [line for section in sections[1:] for line in section if re.match(r"--[a-z]|Available", line)]
     return f"{message} ({offers[0]})" if offers and "nrecognized" in message else message
@@ -48,12 +51,13 @@ def one_line_errors() -> Iterator[None]:
         sys.exit(USAGE_ERROR)
 
 
-def _split(lines: list[str]) -> list[list[str]]:
-    """Return the sections of a box: its title and rules have no text left once the frame is stripped."""
+def _sections(lines: list[str]) -> list[list[str]]:
+    """Return the groups of lines between empty ones, without the title, which comes first."""
     sections: list[list[str]] = [[]]
-    for line in lines[1:]:
+    title = next((i for i, line in enumerate(lines) if line), len(lines))
+    for line in lines[title + 1 :]:
         if line:
             sections[-1].append(line)
         else:
             sections.append([])
-    return sections
+    return [section for section in sections if section]

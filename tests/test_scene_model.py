@@ -25,7 +25,7 @@ def compile_separately(bank: HullBank, object_ids: np.ndarray, meaninertia: floa
     """Build the same scene the ordinary way: one body per object, its hulls as meshes, nothing rewritten."""
     spec = robot.load_spec()
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
-    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     for slot, obj in enumerate(object_ids):
         body = spec.worldbody.add_body(name=f"object_{slot}")
         body.add_freejoint()

@@ -221,9 +221,9 @@ def test_folder_refusals(tmp_path):
     with pytest.raises(ValueError, match="is not a run folder"):
         RunFolder.open(tmp_path / "full", make_config())
     with RunFolder.create(tmp_path / "run", make_config()) as folder:
-        folder.begin_session({"hull bank": "a", "training scenes": "b"}, 0)
+        folder.begin_session({"hull bank": "a", "training scenes": "b"})
         with pytest.raises(ValueError, match=r"another training scenes \(b, now c\)"):
-            folder.begin_session({"hull bank": "a", "training scenes": "c"}, 5)
+            folder.begin_session({"hull bank": "a", "training scenes": "c"})
 
 
 def test_a_full_disk_is_reported_and_survived(tmp_path, monkeypatch):

@@ -63,7 +63,7 @@ def make_slot_model(spec: mujoco.MjSpec, bank: HullBank) -> SlotModel:
     _add_hull_meshes(spec, bank)
     _add_slots(spec, bank)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE | mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     mj_model = spec.compile()
     surplus = [i for i in range(mj_model.ngeom) if mj_model.geom(i).name.startswith("catalogue")]
     mj_model.geom_contype[surplus] = 0

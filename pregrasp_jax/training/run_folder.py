@@ -82,8 +82,8 @@ class RunFolder:
         """Release the lock."""
         self._lock.close()
 
-    def begin_session(self, hashes: dict[str, str], env_steps: int) -> None:
-        """Record versions, machine and hashes, and that a process goes on from `env_steps`.
+    def begin_session(self, hashes: dict[str, str]) -> None:
+        """Record versions, machine and hashes; call it before anything else is written.
 
         Raises:
             ValueError: the run began with other objects or scenes.
@@ -98,7 +98,6 @@ class RunFolder:
             )
         session = {
             "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-            "env_steps": env_steps,
             "versions": versions(),
             "machine": describe_machine(),
         }

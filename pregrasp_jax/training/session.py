@@ -68,8 +68,8 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
     resumed, folder = folder is not None, folder or RunFolder.create(run_dir, config)
     trainer = Trainer(config, folder, program, make_evaluate(validation, config), console)
     with folder, Interrupt(console.say, console.close) as interrupt:
+        folder.begin_session(_hashes(env, validation))
         (trainer.resume if resumed else trainer.begin)()
-        folder.begin_session(_hashes(env, validation), trainer.progress.env_steps)
         try:
             ending = trainer.run(lambda: interrupt.exit_code is not None)
         finally:
