@@ -60,8 +60,8 @@ class Interrupt:
         if self._signal is not None:
             self._before_exit()
             os._exit(128 + number)
-        self._signal = number
         self._say("stopping: this step is finished and a checkpoint is written; a second signal ends at once")
+        self._signal = number
 
 
 def _ignore(number: int, frame: FrameType | None) -> None:

@@ -1,0 +1,114 @@
+"""Guided actions follow their density inside the mask; schedules and epsilon-greedy by hand."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pregrasp_jax import exploration, grid
+from pregrasp_jax.config import ExplorationConfig
+from pregrasp_jax.training.collect import epsilon_at
+
+R_IN, R_OUT = 0.04, 0.15
+P1 = (-0.05, 0.02)
+
+
+def ring(*, full: bool = False) -> np.ndarray:
+    """Cells about P1 by a plain loop over the definition."""
+    mask = np.zeros((100, 100), bool)
+    for row in range(100):
+        for col in range(100):
+            dx, dy = -0.25 + 0.005 * (col + 0.5) - P1[0], -0.25 + 0.005 * (row + 0.5) - P1[1]
+            mask[row, col] = R_IN <= np.hypot(dx, dy) <= R_OUT and (full or dx >= 0)
+    return mask
+
+
+@functools.partial(jax.jit, static_argnames="angle_std")
+def guided(keys: jax.Array, target: jax.Array, mask: jax.Array, angle_std: float) -> jax.Array:
+    draw_one = functools.partial(exploration.guided_action, angle_std=angle_std, open_probability=0.7)
+    return jax.vmap(draw_one, in_axes=(0, None, None, None))(keys, jnp.array(P1), target, mask)
+
+
+def draw(dx: float, dy: float, *, angle_std: float = 0.5, mask: np.ndarray | None = None):
+    """Return angle and radius about P1 and the aperture of guided actions for a target at P1 + (dx, dy)."""
+    mask = ring() if mask is None else mask
+    target = jnp.array([P1[0] + dx, P1[1] + dy])
+    actions = np.asarray(guided(jax.random.split(jax.random.key(0), 3000), target, jnp.asarray(mask), angle_std))
+    row, col, aperture = actions // 200, actions // 2 % 100, actions % 2
+    assert mask[row, col].all()
+    x, y = -0.25 + 0.005 * (col + 0.5) - P1[0], -0.25 + 0.005 * (row + 0.5) - P1[1]
+    return np.arctan2(y, x), np.hypot(x, y), aperture
+
+
+def test_guided_actions_follow_angle_radius_and_aperture():
+    angle, radius, aperture = draw(0.1, 0.02)
+    assert np.mean(angle) == pytest.approx(np.arctan2(0.02, 0.1), abs=0.03)
+    assert np.std(angle) == pytest.approx(0.5, abs=0.03)
+    counts, _ = np.histogram(radius, bins=4, range=(R_IN, R_OUT))
+    np.testing.assert_allclose(counts / len(radius), 0.25, atol=0.04, err_msg="r is uniform, not its area")
+    assert np.mean(aperture) == pytest.approx(0.7, abs=0.03)
+
+
+def test_rows_are_y_and_columns_are_x():
+    angle, _, _ = draw(0.0, 0.2, angle_std=0.2)
+    assert np.mean(angle) == pytest.approx(np.pi / 2, abs=0.2)
+    angle, _, _ = draw(0.0, -0.2, angle_std=0.2)
+    assert np.mean(angle) == pytest.approx(-np.pi / 2, abs=0.2)
+
+
+def test_a_target_behind_the_hand_is_truncated_not_mirrored():
+    angle, _, _ = draw(-0.1, 0.1, angle_std=0.2)
+    assert np.all(angle <= np.pi / 2 + 1e-6) and np.mean(angle) > 1.2
+
+
+def test_the_wrap_at_pi_is_continuous():
+    above, _, _ = draw(-0.1, 1e-4, mask=ring(full=True))
+    below, _, _ = draw(-0.1, -1e-4, mask=ring(full=True))
+    assert np.mean(np.cos(above)) == pytest.approx(np.mean(np.cos(below)), abs=0.03)
+
+
+@pytest.mark.parametrize("angle_std", [0.0, 1e-6])
+def test_no_spread_means_the_direction_itself(angle_std):
+    angle, _, _ = draw(0.1, 0.0, angle_std=angle_std)
+    assert np.all(np.abs(angle) < 0.07)
+
+
+def test_a_single_allowed_cell_is_found_however_unlikely():
+    mask = np.zeros((100, 100), bool)
+    mask[17, 31] = True
+    draw(0.1, 0.1, angle_std=1e-6, mask=mask)
+
+
+def test_an_empty_mask_still_gives_an_action():
+    action = exploration.guided_action(
+        jax.random.key(0),
+        jnp.zeros(2),
+        jnp.ones(2),
+        jnp.zeros((100, 100), bool),
+        angle_std=0.5,
+        open_probability=0.7,
+    )
+    assert 0 <= int(action) < grid.NUM_ACTIONS and action.dtype == jnp.int32
+
+
+def test_random_actions_cover_the_whole_map():
+    actions = np.asarray(jax.vmap(exploration.random_action)(jax.random.split(jax.random.key(1), 20_000)))
+    assert actions.min() < 20 and actions.max() >= grid.NUM_ACTIONS - 20
+    counts, _ = np.histogram(actions, bins=20, range=(0, grid.NUM_ACTIONS))
+    assert np.all(np.abs(counts - 1000) < 160)
+    assert np.mean(actions % 2) == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize(("step", "value"), [(0, 1.0), (5_000, 0.775), (20_000, 0.1), (90_000, 0.1)])
+def test_linear_schedule(step, value):
+    for given in (step, jnp.int32(step)):
+        schedule = exploration.linear_schedule(given, start=1.0, end=0.1, steps=20_000)
+        assert schedule.dtype == jnp.float32 and float(schedule) == pytest.approx(value)
+
+
+def test_the_warm_up_only_explores():
+    config = ExplorationConfig(epsilon_start=0.5, epsilon_end=0.1, epsilon_decay=100)
+    values = [float(epsilon_at(step, config, warmup=50)) for step in (0, 49, 50, 100)]
+    assert values == pytest.approx([1.0, 1.0, 0.3, 0.1])

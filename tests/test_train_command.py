@@ -1,0 +1,150 @@
+"""`train.py`: what is wrong is one line and exit code 2; signals; the real thing killed and resumed (slow)."""
+
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pregrasp_jax.checkpoint import write_config
+from pregrasp_jax.command_line import unbox
+from pregrasp_jax.config import PRESETS
+
+ROOT = Path(__file__).parent.parent
+_spec = importlib.util.spec_from_file_location("train", ROOT / "train.py")
+assert _spec and _spec.loader
+train = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(train)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("", "Expected one of {ci, demo, cpu, paper, resume}"),
+        ("foo", "Unrecognized options: foo (Available subcommands: ci, demo, cpu, paper, resume)"),
+        ("ci", "--run-dir PATH"),
+        ("ci --run-dir {tmp}/new --physics.enginee mjx", "--physics.enginee, mjx (--physics.engine {native,mjx,warp})"),
+        ("ci --run-dir {tmp}/new --physics.engine bullet", "Expected one of ('native', 'mjx', 'warp')"),
+        ("ci --run-dir {tmp}/new --seed 1.5", "Error parsing --seed"),
+        ("ci --run-dir {tmp}/new --replay.hindsight maybe", "'maybe'"),
+        ("ci --run-dir {tmp}/new --no-replay.hindsight", "Unrecognized options: --no-replay.hindsight"),
+        ("ci --run-dir {tmp}/new --task.r-in 3", "task.r_in = 3.0 is out of range; allowed is 0.005 to 0.5"),
+        ("ci --run-dir {tmp}/full", "is not empty and holds no run; allowed is a new or empty folder"),
+        ("ci --run-dir {tmp}/run", "already holds a run; continue it with `python train.py resume"),
+        ("ci --run-dir {tmp}/new --init-from {tmp}/nothing", "nothing does not exist; allowed: a run folder"),
+        ("ci --run-dir {tmp}/new --assets.object-dir {tmp}/nothing", "nothing: no such folder"),
+        ("resume {tmp}/nothing", "is not a run folder"),
+        ("resume {tmp}/typo", "unknown config key sead"),
+        ("resume {tmp}/run --seed 4", "changed configuration (seed: 0 -> 4); allowed to change: train.minutes"),
+    ],
+)
+def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, capsys, arguments, said):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("")
+    write_config(tmp_path / "run" / "config.yaml", PRESETS["ci"])
+    (tmp_path / "typo").mkdir()
+    (tmp_path / "typo" / "config.yaml").write_text("sead: 1\n")
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.setattr(sys, "argv", ["train.py", *arguments.format(tmp=tmp_path).split()])
+    with pytest.raises(SystemExit) as exit_info:
+        train.main()
+    error = capsys.readouterr().err
+    assert exit_info.value.code == 2
+    assert error.startswith("error: ") and error.count("\n") == 1 and said in error
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_help_shows_the_defaults_of_the_preset(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["train.py", "cpu", "--help"])
+    with pytest.raises(SystemExit) as exit_info:
+        train.main()
+    text = " ".join(capsys.readouterr().out.split())
+    assert exit_info.value.code == 0 and "(default: 0.25)" in text and "--replay.hindsight {True,False}" in text
+
+
+BOX = """
+╭─ Unrecognized options ─────────╮
+│ Unrecognized options: --sead,  │
+│ 3                              │
+│ ────────────────────────────── │
+│ Perhaps you meant:             │
+│     --seed INT                 │
+│         Seed. (default: 0)     │
+│ ────────────────────────────── │
+│ For full helptext, run --help  │
+╰────────────────────────────────╯
+"""
+
+
+@pytest.mark.parametrize("frame", [lambda box: box, lambda box: box.translate(str.maketrans("─│╭╮╰╯", "-     "))])
+def test_a_box_becomes_one_line(frame):
+    box = frame(BOX).replace(" - Unrecognized options -", "   Unrecognized options\n--")
+    assert unbox(box) == "Unrecognized options: --sead, 3 (--seed INT)"
+
+
+LISTENER = """
+import hashlib, sys, time
+from pregrasp_jax.training.interrupt import Interrupt
+with Interrupt(lambda line: print(line, flush=True), lambda: print("cursor back", flush=True)) as interrupt:
+    print("ready", flush=True)
+    if sys.argv[1] == "busy":
+        # One bytecode of a minute that gives the GIL away, as a compilation does: Python-level handlers have to wait.
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 10**8)
+    while interrupt.exit_code is None:
+        time.sleep(0.01)
+    print("stopped by the loop", flush=True)
+    sys.exit(interrupt.exit_code)
+"""
+
+
+def _listener(mode: str) -> subprocess.Popen:
+    process = subprocess.Popen([sys.executable, "-c", LISTENER, mode], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout and process.stdout.readline() == "ready\n"
+    return process
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_the_first_signal_asks_the_loop_to_stop(number, code):
+    process = _listener("idle")
+    process.send_signal(number)
+    output, _ = process.communicate(timeout=20)
+    assert process.returncode == code and "stopping" in output and output.endswith("stopped by the loop\n")
+
+
+def test_the_second_signal_ends_a_busy_process_at_once():
+    process = _listener("busy")
+    process.send_signal(signal.SIGINT)
+    assert process.stdout and "stopping" in process.stdout.readline(), "it answers though the main thread is busy"
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=20)
+    assert process.returncode == 130 and output == "cursor back\n"
+
+
+def _rows(path: Path) -> list[dict]:
+    rows = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    return [{key: value for key, value in row.items() if not key.startswith("time/")} for row in rows]
+
+
+def _train(*arguments: str) -> subprocess.Popen:
+    return subprocess.Popen([sys.executable, str(ROOT / "train.py"), *arguments], cwd=ROOT, env=dict(os.environ))
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_real_runs_measure_the_same(tmp_path):
+    options = ["--train.minutes", "0", "--train.episodes", "16", "--train.checkpoint-minutes", "0.01"]
+    assert _train("ci", "--run-dir", f"{tmp_path}/whole", *options).wait() == 0
+    killed = _train("ci", "--run-dir", f"{tmp_path}/killed", *options)
+    metrics = tmp_path / "killed" / "metrics.jsonl"
+    while not (metrics.exists() and len(metrics.read_text().splitlines()) > 8):
+        assert killed.poll() is None
+        time.sleep(0.05)
+    killed.kill()
+    killed.wait()
+    assert _train("resume", f"{tmp_path}/killed").wait() == 0
+    assert _rows(tmp_path / "killed") == _rows(tmp_path / "whole")
