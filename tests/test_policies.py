@@ -175,11 +175,21 @@ def test_lookahead_ranks_success_then_distance_then_failure() -> None:
         value(success, OPEN, 2),
         value(near, CLOSED, 2),
         value(far, CLOSED, 0),
-        value(failure, OPEN, 2),
         value(failure, OPEN, 0),
     ]
     assert ranked == sorted(ranked, reverse=True)
     assert len(set(ranked)) == len(ranked)
+
+
+def test_lookahead_forgives_a_failing_continuation(key: jax.Array) -> None:
+    # Whatever comes first, the straight push that follows it encloses the obstacle in front of the target.
+    env = _world([(-0.1025, 0.0025), (0.0, 0.0025), (0.2, 0.2)])
+    state = env.reset_to(0).replace(p1=jnp.array([-0.2525, 0.0025]))
+    _, result = env.step(state, policies.make_straight(env)(state, key))
+    assert REASONS[int(result.reason)] == "obstacle_in_region"
+    chosen = jax.jit(policies.make_lookahead(env))(state, key)
+    _, result = env.step(state, chosen)
+    assert REASONS[int(result.reason)] == "running"
 
 
 def test_every_script_runs_unbatched_under_jit(key: jax.Array) -> None:
