@@ -77,11 +77,12 @@ class Env:
         object_ids = jnp.asarray(self.scenes.object_ids)[index]
         eligible = (object_ids >= 0) & jnp.asarray(self.bank.eligible)[object_ids]
         target = jax.random.categorical(target_key, jnp.where(eligible, 0.0, -jnp.inf))
-        return self._start(index, yaw, target)
+        return self.start(self._scene(index, yaw, target), index)
 
     def reset_to(self, index: jax.Array) -> EnvState:
         """Return scene `index` of the bank with its own yaw and target."""
-        return self._start(index, jnp.asarray(self.scenes.yaw)[index], jnp.asarray(self.scenes.target)[index])
+        yaw, target = jnp.asarray(self.scenes.yaw)[index], jnp.asarray(self.scenes.target)[index]
+        return self.start(self._scene(index, yaw, target), index)
 
     def step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, StepResult]:
         """Push, look, judge.
@@ -127,8 +128,8 @@ class Env:
         """Close with constant force, lift 0.2 m, hold 5 s; return whether the target stayed between the fingers."""
         times = CTRL_DT * jnp.arange(round((CLOSE_TIME + LIFT_HEIGHT / LIFT_SPEED + HOLD_TIME) / CTRL_DT))
         lift = LIFT_HEIGHT * primitives.minimum_jerk((times - CLOSE_TIME) / (LIFT_HEIGHT / LIFT_SPEED))
-        base = jnp.array([*[0.0] * 2, robot.PUSH_HEIGHT]).at[:2].set(state.p1)
-        positions = base[None] + lift[:, None] * jnp.array([[0.0, 0.0, 1.0]])
+        xy = jnp.broadcast_to(state.p1, (len(times), 2))
+        positions = jnp.concatenate([xy, robot.PUSH_HEIGHT + lift[:, None]], axis=1)
         arm, ok = primitives.plan_arm(state.physics_obs.joint_pos[:6], positions)
         fingers = jnp.full((len(times), 1), robot.FINGER_CLOSED)
         ctrl = jnp.concatenate([arm, fingers], axis=1)
@@ -139,19 +140,15 @@ class Env:
         held = self._coverage(after, state.scene, jnp.int32(OPEN))[target] > 0
         return (rise > _MIN_LIFT) & held & ~after.diverged
 
-    def _start(self, index: jax.Array, yaw: jax.Array, target: jax.Array) -> EnvState:
-        """Return scene `index` turned by `yaw` about the centre, with the open hand at the start."""
-        object_ids = jnp.asarray(self.scenes.object_ids)[index]
-        poses = jax.vmap(functools.partial(_turn, yaw=yaw))(jnp.asarray(self.scenes.poses)[index])
-        poses = jnp.where((object_ids >= 0)[:, None], poses, jnp.asarray(self.scenes.poses)[index])
-        scene = SceneParams(object_ids, poses, target.astype(jnp.int32))
+    def start(self, scene: SceneParams, index: jax.Array | int = -1) -> EnvState:
+        """Return any scene with the open hand at the start; `index` is its row of the bank, -1 for none."""
         blank = jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8)
         physics = self.engine.reset(self.engine.init(), scene)
         return self._look(
             EnvState(
                 physics=physics,
                 scene=scene,
-                scene_index=index.astype(jnp.int32),
+                scene_index=jnp.int32(index),
                 physics_obs=self.engine.observe(physics),
                 obs=Observation(blank, blank),
                 centroids=jnp.zeros((MAX_OBJECTS, 2)),
@@ -160,6 +157,12 @@ class Env:
                 num_pushes=jnp.int32(0),
             )
         )
+
+    def _scene(self, index: jax.Array, yaw: jax.Array, target: jax.Array) -> SceneParams:
+        """Return scene `index` of the bank turned by `yaw` about the centre."""
+        object_ids, poses = jnp.asarray(self.scenes.object_ids)[index], jnp.asarray(self.scenes.poses)[index]
+        turned = jax.vmap(functools.partial(_turn, yaw=yaw))(poses)
+        return SceneParams(object_ids, jnp.where((object_ids >= 0)[:, None], turned, poses), target.astype(jnp.int32))
 
     def _look(self, state: EnvState) -> EnvState:
         """Return the state with everything that is seen or measured brought up to date with its physics."""

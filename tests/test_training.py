@@ -332,8 +332,7 @@ def test_the_learner_measures_what_the_report_prints(monkeypatch):
     monkeypatch.setattr(learner, "update", spy)
     built = make_program(make_config())
     shapes = built.shapes()
-    experience = jax.eval_shape(built.collect, shapes.actors, shapes.learning.learner.params)[1]
-    jax.eval_shape(built.learn, shapes.learning, experience, jnp.int32(1), jnp.float32(0))
+    jax.eval_shape(built.update, shapes.learning, jnp.float32(0))
     assert measured == set(learn.METRICS)
 
 

@@ -155,9 +155,7 @@ def make_collect(
         explore_key, choice_key = jax.random.split(key)
         exploratory = jax.vmap(explore)(jax.random.split(explore_key, num_envs), states, masks)
         random = jax.random.uniform(choice_key, (num_envs,)) < epsilon
-        # While all actions are random the network need not be asked.
-        best = jax.lax.cond(jnp.all(random), lambda *_: exploratory, greedy, params, states, masks)
-        return jnp.where(random, exploratory, best), random
+        return jnp.where(random, exploratory, greedy(params, states, masks)), random
 
     def collect(actors: Actors, params: Params) -> tuple[Actors, Experience]:
         states = actors.env_states

@@ -1,4 +1,8 @@
-"""The learner's side of training: remember a push of every scene, then update a given number of times."""
+"""The learner's side of training: remember a push of every scene, and update.
+
+The two are compiled apart and the host repeats the update: inside a loop of XLA's CPU compiler, convolutions
+lose their fast kernels and an update takes several times as long.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -38,8 +42,11 @@ class Learning(struct.PyTreeNode):
         return self.replace(updates=jnp.int32(0), metrics=jax.tree.map(jnp.zeros_like, self.metrics))
 
 
-LearnFn = Callable[[Learning, Experience, Any, Any], Learning]
-"""``(state, experience, updates () int32, beta () float32) -> state``."""
+RememberFn = Callable[[Learning, Experience], Learning]
+"""``(state, experience) -> state``."""
+
+UpdateFn = Callable[[Learning, Any], Learning]
+"""``(state, beta () float32) -> state``; beta is the importance exponent."""
 
 
 def num_updates(env_steps: int, config: LearnerConfig) -> int:
@@ -75,7 +82,19 @@ def init_learning(
     )
 
 
-def make_learn(
+def make_remember(config: ReplayConfig) -> RememberFn:
+    """Return the function that adds one push of every scene to the memory, and hindsight rows where they are due."""
+
+    def remember(state: Learning, experience: Experience) -> Learning:
+        replay = replay_lib.add(state.replay, experience.steps)
+        if config.hindsight:
+            replay = hindsight.add_hindsight(replay, experience.eligible)
+        return state.replace(replay=replay)
+
+    return remember
+
+
+def make_update(
     *,
     apply_fn: ApplyFn,
     q_at_fn: QAtFn,
@@ -84,8 +103,8 @@ def make_learn(
     optimizer: optax.GradientTransformation,
     config: LearnerConfig,
     replay_config: ReplayConfig,
-) -> LearnFn:
-    """Return the function that remembers one push of every scene, then updates; beta is the importance exponent.
+) -> UpdateFn:
+    """Return the function that updates once.
 
     Args:
         apply_fn: the network on the whole grid.
@@ -94,11 +113,10 @@ def make_learn(
         input_fn: fuses an observation for a goal.
         optimizer: see `make_optimizer`.
         config: discount, loss, batch.
-        replay_config: prioritization and hindsight.
+        replay_config: prioritization.
     """
 
-    def update_once(_: Any, carry: tuple[Learning, jax.Array]) -> tuple[Learning, jax.Array]:
-        state, beta = carry
+    def update(state: Learning, beta: jax.Array) -> Learning:
         key, sample_key = jax.random.split(state.key)
         batch = replay_lib.sample(
             state.replay, sample_key, batch_size=config.batch_size, importance_exponent=beta, input_fn=input_fn
@@ -118,16 +136,9 @@ def make_learn(
             state.replay, batch.rows, td_errors, priority_exponent=replay_config.priority_exponent
         )
         metrics = _accumulate(state.metrics, metrics, state.updates)
-        return Learning(learner_state, replay, key, state.updates + 1, metrics), beta
+        return Learning(learner_state, replay, key, state.updates + 1, metrics)
 
-    def learn(state: Learning, experience: Experience, updates: jax.Array, beta: jax.Array) -> Learning:
-        replay = replay_lib.add(state.replay, experience.steps)
-        if replay_config.hindsight:
-            replay = hindsight.add_hindsight(replay, experience.eligible)
-        updates = jnp.where(replay.num_alive > 0, updates, 0)
-        return jax.lax.fori_loop(0, updates, update_once, (state.replace(replay=replay), beta))[0]
-
-    return learn
+    return update
 
 
 def make_optimizer(config: LearnerConfig) -> optax.GradientTransformation:

@@ -19,7 +19,15 @@ from pregrasp_jax.learning.learner import Params
 from pregrasp_jax.learning.networks import QNetwork
 from pregrasp_jax.learning.replay import InputFn
 from pregrasp_jax.training.collect import Actors, CollectFn, Environment, Experience, init_actors, make_collect
-from pregrasp_jax.training.learn import LearnFn, Learning, init_learning, make_learn, make_optimizer
+from pregrasp_jax.training.learn import (
+    Learning,
+    RememberFn,
+    UpdateFn,
+    init_learning,
+    make_optimizer,
+    make_remember,
+    make_update,
+)
 
 CACHE_SWITCH = "PREGRASP_JAX_COMPILATION_CACHE"
 """Environment variable: 0 turns the compilation cache off."""
@@ -60,19 +68,21 @@ class Program:
     Attributes:
         init: ``key -> TrainState``.
         collect: pushes once in every scene; donates the actors.
-        learn: remembers and updates; donates the learning state.
+        remember: adds a push of every scene to the memory; donates the learning state.
+        update: samples and updates once; donates the learning state.
     """
 
     init: Callable[[jax.Array], TrainState]
     collect: CollectFn
-    learn: LearnFn
+    remember: RememberFn
+    update: UpdateFn
 
     def shapes(self) -> TrainState:
         """Return the shapes of the state without making one."""
         return jax.eval_shape(self.init, jax.random.key(0))
 
     def compile(self, state: TrainState) -> tuple["Program", float]:
-        """Return the program with `collect` and `learn` compiled for a state, and the seconds that it took.
+        """Return the program compiled for a state, and the seconds that it took.
 
         Compiled ahead, a function that would need a second trace fails instead of compiling in silence.
         """
@@ -80,12 +90,9 @@ class Program:
         params = state.learning.learner.params
         collect = jax.jit(self.collect, donate_argnums=0).lower(state.actors, params).compile()
         experience = jax.eval_shape(self.collect, state.actors, params)[1]
-        learn = (
-            jax.jit(self.learn, donate_argnums=0)
-            .lower(state.learning, experience, np.int32(0), np.float32(0))
-            .compile()
-        )
-        return Program(self.init, collect, learn), time.perf_counter() - start
+        remember = jax.jit(self.remember, donate_argnums=0).lower(state.learning, experience).compile()
+        update = jax.jit(self.update, donate_argnums=0).lower(state.learning, np.float32(0)).compile()
+        return Program(self.init, collect, remember, update), time.perf_counter() - start
 
 
 def make_program(
@@ -138,7 +145,7 @@ def make_program(
         )
         return TrainState(actors, learning)
 
-    learn = make_learn(
+    update = make_update(
         apply_fn=apply_fn,
         q_at_fn=q_at_fn,
         mask_fn=env.action_mask,
@@ -149,7 +156,7 @@ def make_program(
     )
     if params is not None:
         _refuse_misfit(params, network, config)
-    return Program(init, collect, learn)
+    return Program(init, collect, make_remember(config.replay), update)
 
 
 def enable_compilation_cache() -> None:

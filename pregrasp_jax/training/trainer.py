@@ -155,7 +155,9 @@ class Trainer:
             actors, experience = program.collect(state.actors, state.learning.learner.params)
             progress.episodes = int(experience.episodes)
         with progress.timed("learn"):
-            learning = program.learn(state.learning, experience, np.int32(updates), np.float32(self._beta()))
+            learning = program.remember(state.learning, experience)
+            for _ in range(updates if learning.replay.num_alive else 0):
+                learning = program.update(learning, np.float32(self._beta()))
             jax.block_until_ready(learning.updates)
         self.state = TrainState(actors, learning)
 

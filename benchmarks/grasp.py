@@ -1,0 +1,71 @@
+"""Grasp every eligible object at the palm under six yaws; prints one JSON object.
+
+    python benchmarks/grasp.py [--object-set seen] [--object-dir DIR]
+
+The object stands alone against the palm of the open hand, centred between the fingers, as a perfect push would
+leave it. The fingers close with constant force, lift 0.2 m and hold 5 s.
+"""
+
+import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
+
+# isort: split
+import argparse
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pregrasp_jax.config import PRESETS, AssetsConfig
+from pregrasp_jax.env import Env, make_env
+from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot.closing_region import closing_region_bounds
+from pregrasp_jax.scene.model import parking_poses
+from pregrasp_jax.types import MAX_OBJECTS, EnvState, SceneParams
+
+NUM_YAWS = 6
+GAP = 0.001
+"""m between palm and object."""
+
+
+def scene_at_palm(env: Env, obj: int, yaw: float) -> SceneParams:
+    """Return a scene of one object that stands against the palm of the hand at the start pose."""
+    hulls = np.asarray(env.bank.object_hulls[obj])
+    points = np.asarray(env.bank.full.vertices)[hulls[hulls >= 0]].reshape(-1, 3)[:, :2]
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    points = points @ turn.T
+    palm = closing_region_bounds()[0][0]
+    x = robot.START_POSE[0] + palm + GAP - points[:, 0].min()
+    y = -(points[:, 1].min() + points[:, 1].max()) / 2
+    poses = parking_poses()
+    poses[0] = [x, y, 0, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+    object_ids = np.full(MAX_OBJECTS, -1)
+    object_ids[0] = obj
+    return SceneParams(jnp.asarray(object_ids), jnp.asarray(poses, jnp.float32), jnp.int32(0))
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--object-set", choices=["seen", "unseen"], default="seen", help="which objects")
+    parser.add_argument("--object-dir", help="folder of meshes instead of the built-in catalogue")
+    arguments = parser.parse_args()
+    assets = AssetsConfig(object_dir=arguments.object_dir, object_set=arguments.object_set)
+    config = dataclasses.replace(PRESETS["ci"], assets=assets)
+    env = make_env(config, split="test")
+    objects = [int(i) for i in np.flatnonzero(np.asarray(env.bank.eligible))]
+    scenes = [scene_at_palm(env, i, yaw) for i in objects for yaw in np.pi / NUM_YAWS * np.arange(NUM_YAWS)]
+
+    def attempt(scene: SceneParams) -> jax.Array:
+        state: EnvState = env.start(scene)
+        return env.grasp(state)
+
+    held = np.asarray(jax.jit(jax.vmap(attempt))(jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)))
+    held = held.reshape(len(objects), NUM_YAWS)
+    by_object = {env.bank.names[i]: float(rate) for i, rate in zip(objects, held.mean(axis=1), strict=True)}
+    print(json.dumps({"grasp_rate": float(held.mean()), "grasps": int(held.size), "by_object": by_object}))
+
+
+if __name__ == "__main__":
+    main()
