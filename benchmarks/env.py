@@ -61,17 +61,6 @@ def full_step(env: Env, state: EnvState, key: jax.Array) -> tuple[EnvState, jax.
     return jax.tree.map(choose, fresh, next_state), jnp.linalg.norm(next_state.p1 - state.p1, axis=-1)
 
 
-def seconds(function: Callable[..., Any], *arguments: Any, repeats: int) -> float:
-    """Return the median seconds of a jitted function after one warm-up."""
-    jax.block_until_ready(function(*arguments))
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(function(*arguments))
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
-
-
 def measure(num_scenes: int, num_steps: int) -> dict[str, Any]:
     """Run `num_steps` full steps of `num_scenes` scenes, and each stage alone on states met on the way."""
     config = PRESETS["cpu"]
@@ -80,13 +69,15 @@ def measure(num_scenes: int, num_steps: int) -> dict[str, Any]:
     step = jax.jit(functools.partial(full_step, env))
     key = jax.random.key(0)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, num_scenes))
-    state, _ = jax.block_until_ready(step(state, key))
-    times, lengths, parts = [], [], {"plan": 0.0, "physics": 0.0, "heightmap": 0.0}
+    state, _ = jax.block_until_ready(step(state, key))  # compiles
+    stages = compile_stages(env)
+    time_stages(stages, state, key)  # compiles
+    times, lengths = [], []
+    parts: dict[str, float] = {"plan": 0.0, "physics": 0.0, "heightmap": 0.0}
     for i in range(num_steps):
         step_key = jax.random.fold_in(key, i)
-        if i % max(num_steps // 4, 1) == 0:
-            for name, value in measure_stages(env, state, step_key).items():
-                parts[name] += value / len(range(0, num_steps, max(num_steps // 4, 1)))
+        for name, value in time_stages(stages, state, step_key).items():
+            parts[name] += value / num_steps
         start = time.perf_counter()
         state, moved = jax.block_until_ready(step(state, step_key))
         times.append(time.perf_counter() - start)
@@ -104,10 +95,8 @@ def measure(num_scenes: int, num_steps: int) -> dict[str, Any]:
     }
 
 
-def measure_stages(env: Env, state: EnvState, key: jax.Array) -> dict[str, float]:
-    """Return seconds per parallel step of planning, physics and heightmap, each compiled alone."""
-    num_scenes = state.num_pushes.shape[0]
-    actions = jax.vmap(sample_action)(state, jax.random.split(jax.random.split(key)[0], num_scenes))
+def compile_stages(env: Env) -> dict[str, Callable[..., Any]]:
+    """Return the stages of a step, each vmapped and compiled alone."""
 
     def plan(state: EnvState, action: jax.Array) -> primitives.Plan:
         row, col, aperture = grid.decode_action(action)
@@ -121,18 +110,31 @@ def measure_stages(env: Env, state: EnvState, key: jax.Array) -> dict[str, float
             num_rows=primitives.num_push_rows(env.max_distance, env.task.push_speed),
         )
 
-    def run(state: EnvState, plan: primitives.Plan) -> Any:
+    def physics(state: EnvState, plan: primitives.Plan) -> Any:
         return env.engine.run(state.physics, plan.ctrl, jnp.where(plan.reachable, plan.num_ctrl, 0))
 
     def look(state: EnvState) -> Any:
         return heightmap.observe(heightmap.scene_hulls(env.bank, state.scene, state.physics_obs))
 
-    plan, run, look = (jax.jit(jax.vmap(f)) for f in (plan, run, look))
-    return {
-        "plan": seconds(plan, state, actions, repeats=3),
-        "physics": seconds(run, state, plan(state, actions), repeats=1),
-        "heightmap": 2 * seconds(look, state, repeats=3),  # a full step looks twice: after the push, after the reset
-    }
+    stages = {"action": sample_action, "plan": plan, "physics": physics, "heightmap": look}
+    return {name: jax.jit(jax.vmap(function)) for name, function in stages.items()}
+
+
+def time_stages(stages: dict[str, Callable[..., Any]], state: EnvState, key: jax.Array) -> dict[str, float]:
+    """Return the seconds of each stage in the step that `full_step` takes from this state with this key."""
+    actions = stages["action"](state, jax.random.split(jax.random.split(key)[0], state.num_pushes.shape[0]))
+    plan, plan_seconds = timed(stages["plan"], state, actions)
+    _, physics_seconds = timed(stages["physics"], state, plan)
+    _, look_seconds = timed(stages["heightmap"], state)
+    # A full step looks twice: after the push and after the reset.
+    return {"plan": plan_seconds, "physics": physics_seconds, "heightmap": 2 * look_seconds}
+
+
+def timed(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
+    """Return a result and the seconds it took."""
+    start = time.perf_counter()
+    result = jax.block_until_ready(function(*arguments))
+    return result, time.perf_counter() - start
 
 
 def pybullet_worker(num_steps: int, seed: int, queue: Any) -> None:

@@ -5,6 +5,7 @@ the program, so that a value out of range is one line before anything compiles.
 """
 
 import dataclasses
+import operator
 import types
 import typing
 from collections.abc import Mapping
@@ -89,7 +90,9 @@ class ReplayConfig:
     priority_exponent: float = 0.6
     """Alpha of prioritized replay; 0 samples uniformly."""
     importance_exponent: float = 0.4
-    """Beta at the start; it rises linearly to 1 over the run."""
+    """Beta at the start."""
+    importance_steps: int = 150_000
+    """Env steps over which beta rises linearly to 1."""
     hindsight: bool = True
     """Replay episodes that enclosed an obstacle with that obstacle as the target; False is the No-HER ablation."""
 
@@ -108,8 +111,8 @@ class LearnerConfig:
     """Where the Huber loss turns linear (Eq. 4)."""
     batch_size: int = 16
     """Transitions per update."""
-    updates_per_step: float = 0.125
-    """Updates per env step (a push of one scene); 16 scenes at 0.125 make 2 updates per parallel step."""
+    updates_per_step: float = 0.25
+    """Updates per env step (a push of one scene); 16 scenes at 0.25 make 4 updates per parallel step."""
     warmup: int = 500
     """Env steps of pure exploration before the first update."""
 
@@ -173,8 +176,7 @@ class Config:
             ValueError: a value is outside its range; one line names the key, the value and the range.
         """
         for key, (low, high) in _RANGES.items():
-            stage, name = key.split(".")
-            value = getattr(getattr(self, stage), name)
+            value = operator.attrgetter(key)(self)
             if not low <= value <= high:
                 raise ValueError(f"{key} = {value} is out of range; allowed is {low} to {high}")
         if self.task.r_in >= self.task.r_out:
@@ -188,8 +190,9 @@ class Config:
 
 
 _RANGES: dict[str, tuple[float, float]] = {
-    "scene.min_objects": (1, 8),
-    "scene.max_objects": (1, 8),
+    "seed": (0, 2**32 - 1),
+    "scene.min_objects": (2, 8),
+    "scene.max_objects": (2, 8),
     "scene.train_scenes": (1, 100_000),
     "scene.validation_scenes": (1, 100_000),
     "scene.test_scenes": (1, 100_000),
@@ -203,6 +206,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "replay.capacity": (64, 10_000_000),
     "replay.priority_exponent": (0.0, 1.0),
     "replay.importance_exponent": (0.0, 1.0),
+    "replay.importance_steps": (1, 1_000_000_000),
     "learner.learning_rate": (1e-7, 1.0),
     "learner.discount": (0.0, 0.999),
     "learner.polyak": (0.0, 1.0),
@@ -232,7 +236,7 @@ PRESETS: dict[str, Config] = {
     "ci": Config(
         scene=SceneConfig(train_scenes=4, validation_scenes=2, test_scenes=2),
         network=NetworkConfig(width=0.0625),
-        replay=ReplayConfig(capacity=256),
+        replay=ReplayConfig(capacity=256, importance_steps=200),
         learner=LearnerConfig(batch_size=4, warmup=8, updates_per_step=0.5),
         exploration=ExplorationConfig(epsilon_decay=64),
         train=TrainConfig(num_envs=2, episodes=1_000_000, minutes=1.0, evaluate_every=0, log_every=2),
@@ -240,7 +244,7 @@ PRESETS: dict[str, Config] = {
     "demo": dataclasses.replace(
         _CPU,
         scene=SceneConfig(train_scenes=64, validation_scenes=10, test_scenes=50),
-        replay=ReplayConfig(capacity=5_000),
+        replay=ReplayConfig(capacity=5_000, importance_steps=5_000),
         exploration=ExplorationConfig(epsilon_decay=3_000),
         train=TrainConfig(num_envs=16, episodes=2_000, minutes=5.0, evaluate_every=0),
     ),

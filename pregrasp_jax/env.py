@@ -182,7 +182,7 @@ class Env:
         com_z = jax.vmap(geometry.transform_points)(poses, jnp.asarray(self.bank.com)[before.scene.object_ids])[:, 2]
         beyond = jnp.any(jnp.abs(after.centroids) > grid.WORKSPACE_HALF_SIZE, axis=-1)
         up_z = 1 - 2 * (poses[:, 4] ** 2 + poses[:, 5] ** 2)
-        end_error = jnp.linalg.norm(after.physics_obs.hand_pose[:2] - after.p1)
+        end_error = jnp.linalg.norm(after.physics_obs.hand_pose[:3] - jnp.append(after.p1, robot.PUSH_HEIGHT))
         return Outcome(
             coverage=self._coverage(after.physics_obs, before.scene, after.aperture),
             distance_before=_distance(before),
@@ -211,11 +211,17 @@ def make_env(
     """
     threads = config.physics.threads if threads is None else threads
     bank = load_bank_for(config.assets.object_dir, config.assets.object_set)
-    scenes = scene_bank.load_or_build(bank, config.scene, split, threads=threads, progress=progress)
     engine = make_engine(config.physics.engine, bank, threads=threads)
+    scenes = scene_bank.load_or_build(bank, config.scene, split, threads=threads, progress=progress)
     guided = config.exploration.guided
     max_distance = config.task.r_out if guided else float(np.hypot(0.5, 0.5) + 0.1)
-    return Env(task=config.task, bank=bank, scenes=scenes, engine=engine, max_distance=max_distance)
+    env = Env(task=config.task, bank=bank, scenes=scenes, engine=engine, max_distance=max_distance)
+    if not env.action_mask(jnp.asarray(robot.START_POSE[:2], jnp.float32)).any():
+        raise ValueError(
+            f"task.r_out = {config.task.r_out} leaves no cell of the workspace within reach of the start pose "
+            f"(x = {robot.START_POSE[0]} m); allowed is 0.06 or more"
+        )
+    return env
 
 
 def with_task(env: Env, **changes: object) -> Env:

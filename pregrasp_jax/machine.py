@@ -3,13 +3,15 @@
 import importlib.metadata
 import platform
 
-_PACKAGES = ("pregrasp_jax", "mujoco", "mujoco-mjx", "jax", "jaxlib", "flax", "optax", "numpy")
+import pregrasp_jax
+
+_PACKAGES = ("mujoco", "mujoco-mjx", "jax", "jaxlib", "flax", "optax", "numpy")
 """Packages that can change a number."""
 
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of every package that can change a result; "absent" if not installed."""
-    found = {"python": platform.python_version()}
+    found = {"python": platform.python_version(), "pregrasp_jax": pregrasp_jax.__version__}
     for package in _PACKAGES:
         try:
             found[package] = importlib.metadata.version(package)

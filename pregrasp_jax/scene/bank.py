@@ -15,6 +15,7 @@ import numpy as np
 
 from pregrasp_jax import io
 from pregrasp_jax.config import SceneConfig
+from pregrasp_jax.robot.description import mjcf_dir
 from pregrasp_jax.scene import model as slot_model
 from pregrasp_jax.scene import packing
 from pregrasp_jax.types import MAX_OBJECTS, HullBank
@@ -62,7 +63,8 @@ class SceneBank:
 def bank_hash(bank: HullBank, config: SceneConfig, split: Split) -> str:
     """Return the hash of what shapes a scene bank: objects, settings, MuJoCo, and the code that packs."""
     sizes = (config.min_objects, config.max_objects, num_scenes(config, split), config.bank_seed, split)
-    sources = [inspect.getsource(module).encode() for module in (packing, slot_model)]
+    sources = [inspect.getsource(part).encode() for part in (packing, slot_model, _draw)]
+    sources.append((mjcf_dir() / "table.xml").read_bytes())
     return io.content_hash(bank.content_hash, list(sizes), mujoco.__version__, *sources)
 
 

@@ -80,8 +80,7 @@ def make_slot_model(spec: mujoco.MjSpec, bank: HullBank) -> SlotModel:
         slot_dof_ids=dofs[:, None] + np.arange(6),
         fields=_tabulate(mj_model, bank),
     )
-    empty = dict.fromkeys(range(MAX_OBJECTS), -1)
-    write_slots(model, mj_model, np.array(list(empty.values())))
+    write_slots(model, mj_model, np.full(MAX_OBJECTS, -1))
     return model
 
 

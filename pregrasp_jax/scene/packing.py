@@ -14,7 +14,6 @@ from pregrasp_jax.scene import model as slot_model
 from pregrasp_jax.scene.model import SlotModel
 from pregrasp_jax.types import HullBank
 
-SIM_DT = 0.004
 SERVO_SPEED = 0.12
 """m/s toward the centre."""
 SERVO_RATE = 40.0

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from pregrasp_jax import exploration
 from pregrasp_jax.checkpoint import restore, save, save_policy
 from pregrasp_jax.config import Config
 from pregrasp_jax.learning.learner import Params
@@ -156,15 +157,17 @@ class Trainer:
             progress.episodes = int(experience.episodes)
         with progress.timed("learn"):
             learning = program.remember(state.learning, experience)
-            for _ in range(updates if learning.replay.num_alive else 0):
-                learning = program.update(learning, np.float32(self._beta()))
+            beta = np.float32(self._beta())
+            for _ in range(updates if updates and learning.replay.num_alive else 0):
+                learning = program.update(learning, beta)
             jax.block_until_ready(learning.updates)
         self.state = TrainState(actors, learning)
 
     def _beta(self) -> float:
-        """Return the importance exponent, which rises to 1 over `train.episodes`."""
-        beta = self.config.replay.importance_exponent
-        return beta + (1.0 - beta) * min(1.0, self.progress.episodes / self.config.train.episodes)
+        """Return the importance exponent."""
+        replay = self.config.replay
+        start, steps = replay.importance_exponent, replay.importance_steps
+        return float(exploration.linear_schedule(self.progress.env_steps, start=start, end=1.0, steps=steps))
 
     def log(self) -> None:
         """Append a row to metrics.jsonl, show it, and count anew.
@@ -199,6 +202,7 @@ class Trainer:
         params = self.state.learning.learner.params
         with progress.timed("evaluate"):
             measured = self.evaluate_fn(params)
+        self._saved_at = -1  # the best score is part of a checkpoint
         where = {"env_steps": progress.env_steps, "episodes": progress.episodes}
         row = where | {f"eval/{name}": value for name, value in measured.items()}
         self._write("metrics", lambda: self.folder.append_metrics(row))
