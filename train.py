@@ -63,11 +63,12 @@ def _resume(stored: Config) -> Callable[..., Command]:
 
 def _stored_config() -> Config:
     """Return the configuration of the run that the command line resumes, or the default to print help with."""
-    if sys.argv[1:2] != ["resume"] or len(sys.argv) < 3 or sys.argv[2].startswith("-"):
+    if sys.argv[1:2] != ["resume"] or len(sys.argv) < 3 or {"-h", "--help"} & set(sys.argv):
         return Config()
     from pregrasp_jax.training.run_folder import stored_config
 
-    return stored_config(Path(sys.argv[2]))
+    runs = [argument for argument in sys.argv[2:] if (Path(argument) / "config.yaml").is_file()]
+    return stored_config(Path(runs[0] if runs else sys.argv[2]))
 
 
 if __name__ == "__main__":

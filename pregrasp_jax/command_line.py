@@ -43,11 +43,16 @@ def unbox(text: str) -> str:
 
 @contextlib.contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Turn a refusal (ValueError, FileNotFoundError, ...) into one line on standard error and exit code 2."""
+    """Turn a refusal (ValueError, FileNotFoundError, ...) into one line on standard error and exit code 2.
+
+    Errors of several lines come from libraries, not from this package's checks, and keep their traceback.
+    """
     try:
         yield
-    except (ValueError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+    except (ValueError, OSError, FloatingPointError) as error:
+        if "\n" in str(error):
+            raise
+        print(f"error: {error}", file=sys.stderr)
         sys.exit(USAGE_ERROR)
 
 

@@ -1,4 +1,4 @@
-"""Exploration (Sec. III-E): epsilon-greedy, whose random actions aim at the target inside the half ring.
+"""Exploration (Sec. III-E): random actions that aim at the target inside the half ring.
 
 Every function describes one scene (unbatched) and is vmapped by its caller.
 """
@@ -65,8 +65,3 @@ def random_action(key: jax.Array) -> jax.Array:
         () int32 action. A cell that the hand cannot reach ends the episode, as in the paper's ablation.
     """
     return jax.random.randint(key, (), 0, grid.NUM_ACTIONS, dtype=jnp.int32)
-
-
-def epsilon_greedy(key: jax.Array, greedy: jax.Array, exploratory: jax.Array, epsilon: jax.Array) -> jax.Array:
-    """Return the exploratory action () with probability epsilon, else the greedy one; epsilon 1 always explores."""
-    return jnp.where(jax.random.uniform(key) < epsilon, exploratory, greedy)

@@ -4,7 +4,7 @@ Host-side arithmetic on counts; nothing here needs jax.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -173,8 +173,19 @@ def _compare_pairs(a: Mapping[str, Any], b: Mapping[str, Any], pairs: list[tuple
         difference=(only_a - only_b) / trials,
         difference_ci95=paired_difference_interval(both, only_a, only_b, neither),
         p_value=mcnemar_exact(only_a, only_b),
-        settings=tuple(f"{key}: {a[key]} | {b[key]}" for key in ("camera", "physics", "seed") if a[key] != b[key]),
+        settings=tuple(_differences(a, b)),
     )
+
+
+def _differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
+    """Yield one line for every setting in which two paired evaluations differ."""
+    for key in ("camera", "physics", "seed"):
+        if a[key] != b[key]:
+            yield f"{key}: {a[key]} | {b[key]}"
+    tasks = [document.get("config", {}).get("task", {}) for document in (a, b)]
+    for key in sorted(set(tasks[0]) & set(tasks[1]) - {"camera"}):
+        if tasks[0][key] != tasks[1][key]:
+            yield f"task.{key}: {tasks[0][key]} | {tasks[1][key]}"
 
 
 def format_comparison(comparison: Comparison) -> str:

@@ -109,7 +109,8 @@ def test_zero_rows_change_nothing(engine, scenes):
     np.testing.assert_array_equal(state.bits, after.bits)
 
 
-def test_a_diverged_scene_is_reported_alone_and_stays_diverged(engine, scenes):
+def test_a_diverged_scene_is_reported_alone_and_stays_diverged(engine, scenes, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     scene = packed_scene(scenes, 0)
     bad = dataclasses.replace(scene, poses=scene.poses.at[0, 2].set(jnp.nan))
     both = jax.tree.map(lambda *x: jnp.stack(x), bad, scene)
@@ -119,6 +120,7 @@ def test_a_diverged_scene_is_reported_alone_and_stays_diverged(engine, scenes):
 
     state = jax.jit(jax.vmap(run))(both)
     np.testing.assert_array_equal(state.diverged, [True, False])
+    assert not list(tmp_path.iterdir()), "MuJoCo must not leave a log file behind"
     again = jax.vmap(lambda s: push(engine, s, robot.START_POSE[:2], (-0.25, 0.0)))(state)
     np.testing.assert_array_equal(again.diverged, [True, False])
 

@@ -3,13 +3,12 @@
 import dataclasses
 from pathlib import Path
 
-from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.cli.film import film_episodes
 from pregrasp_jax.cli.player import PRETRAINED, EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.cli.progress import EpisodeProgress
 from pregrasp_jax.config import PRESETS
 from pregrasp_jax.evaluation import format_evaluations
-from pregrasp_jax.training.session import train
+from pregrasp_jax.training.session import resume, train
 
 _SCRIPTS, _FILMED = ("random", "straight", "clear"), 3
 
@@ -18,17 +17,15 @@ def demo(*, run_dir: Path = Path("runs/demo"), minutes: float = 5.0, episodes: i
     """Train briefly, evaluate beside the scripts (and the shipped policy, if any), and write a film.
 
     Args:
-        run_dir: the training goes here; a finished one is used as it is.
+        run_dir: the training goes here; one that was interrupted goes on, a finished one is used as it is.
         minutes: of training; enough to see every part work, not to learn the task.
         episodes: test scenes for each policy.
     """
     preset = PRESETS["demo"]
     config = dataclasses.replace(preset, train=dataclasses.replace(preset.train, minutes=minutes)).validate()
-    if not (run_dir / "config.yaml").exists():
-        if code := train(config, run_dir):
-            raise SystemExit(code)
-    else:
-        print(f"using the run in {run_dir}: {load_policy(run_dir).origin}")
+    begun = (run_dir / "config.yaml").exists()
+    if code := resume(config, run_dir) if begun else train(config, run_dir):
+        raise SystemExit(code)
     shipped = ("pretrained",) if PRETRAINED.is_dir() else ()
     players, documents = {}, []
     for policy in (*_SCRIPTS, str(run_dir), *shipped):

@@ -91,6 +91,9 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     """
     trained = _load(request.policy)
     config = _environment_config(request, Config() if trained is None else trained.config)
+    if trained is not None and trained.config.assets.object_dir != request.assets.object_dir:
+        folders = (trained.config.assets.object_dir, request.assets.object_dir)
+        say("note: trained on {}, evaluated on {}".format(*(folder or "the built-in objects" for folder in folders)))
 
     def packed(done: int, total: int) -> None:
         if done == total or done % _PACKING < 16:

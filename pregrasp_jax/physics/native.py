@@ -51,6 +51,7 @@ class Simulations:
     """
 
     def __init__(self, model: SlotModel, *, threads: int = 0):
+        slot_model.silence_warnings()
         self.model = model
         self.num_substeps = round(CTRL_DT / model.mj_model.opt.timestep)
         self._threads = threads

@@ -84,6 +84,14 @@ def make_slot_model(spec: mujoco.MjSpec, bank: HullBank) -> SlotModel:
     return model
 
 
+def silence_warnings() -> None:
+    """Keep MuJoCo from printing warnings and appending them to a file in the working folder.
+
+    Nothing is lost: `mujoco.batch.Batch.warning` counts them for each scene, and a scene that warns is diverged.
+    """
+    mujoco.set_mju_user_warning(lambda _: None)
+
+
 def write_slots(model: SlotModel, target: mujoco.MjModel, object_ids: np.ndarray) -> None:
     """Put objects into the slots of `target`, a model compiled like `model.mj_model`, and update its constants.
 

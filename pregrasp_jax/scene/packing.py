@@ -74,6 +74,7 @@ class Packer:
     """Packs many scenes at once on the table alone (the robot is absent, so it cannot be in the way)."""
 
     def __init__(self, bank: HullBank, num_scenes: int, *, threads: int = 0):
+        slot_model.silence_warnings()
         self._model = slot_model.make_slot_model(table_spec(), bank)
         self._batch = Batch(self._model.mj_model, num_scenes, threads)
         names = (*slot_model.GEOM_FIELDS, *slot_model.BODY_FIELDS, slot_model.RBOUND)

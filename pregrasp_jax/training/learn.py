@@ -118,12 +118,14 @@ def make_update(
 
     def update(state: Learning, beta: jax.Array) -> Learning:
         key, sample_key = jax.random.split(state.key)
-        batch = replay_lib.sample(
-            state.replay, sample_key, batch_size=config.batch_size, importance_exponent=beta, input_fn=input_fn
-        )
-        learner_state, td_errors, metrics = learner.update(
+        learner_state, replay, metrics = learner.learn(
             state.learner,
-            batch,
+            state.replay,
+            sample_key,
+            batch_size=config.batch_size,
+            input_fn=input_fn,
+            importance_exponent=beta,
+            priority_exponent=replay_config.priority_exponent,
             apply_fn=apply_fn,
             mask_fn=mask_fn,
             optimizer=optimizer,
@@ -131,9 +133,6 @@ def make_update(
             discount=config.discount,
             polyak=config.polyak,
             huber_delta=config.huber_delta,
-        )
-        replay = replay_lib.set_priorities(
-            state.replay, batch.rows, td_errors, priority_exponent=replay_config.priority_exponent
         )
         metrics = _accumulate(state.metrics, metrics, state.updates)
         return Learning(learner_state, replay, key, state.updates + 1, metrics)

@@ -69,7 +69,7 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
     trainer = Trainer(config, folder, program, make_evaluate(validation, config), console)
     with folder, Interrupt(console.say, console.close) as interrupt:
         folder.begin_session(_hashes(env, validation))
-        (trainer.resume if resumed else trainer.begin)()
+        (trainer.resume if resumed and folder.has_checkpoint else trainer.begin)()
         try:
             ending = trainer.run(lambda: interrupt.exit_code is not None)
         finally:

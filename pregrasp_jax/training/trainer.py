@@ -90,6 +90,7 @@ class Trainer:
         self.console = console
         self.progress = Progress()
         self._saved_at = -1
+        self._unsaved = True
         self._tried_to_save_at = 0.0
         self._logged_at = (0, 0.0)
 
@@ -111,7 +112,7 @@ class Trainer:
         self.state = restored.tree.join(restored.ring)
         self.progress = Progress(**restored.extra)
         self.folder.forget_metrics_after(restored.step)
-        self._saved_at, self._tried_to_save_at = restored.step, self.progress.total_seconds
+        self._saved_at, self._tried_to_save_at, self._unsaved = restored.step, self.progress.total_seconds, False
         self._logged_at = (restored.step, self.progress.total_seconds)
         self.console.say(f"resuming {self.folder.path} at step {restored.step}, episode {self.progress.episodes}")
 
@@ -173,7 +174,7 @@ class Trainer:
         """Append a row to metrics.jsonl, show it, and count anew.
 
         Raises:
-            FloatingPointError: the loss is no longer finite; the last checkpoint is.
+            FloatingPointError: the loss is no longer finite; all checkpoints are.
         """
         progress, actors, learning = self.progress, self.state.actors, self.state.learning
         row = collect.report(actors.tally) | learn.report(learning)
@@ -182,16 +183,21 @@ class Trainer:
         row |= {"train/epsilon": float(epsilon), "time/seconds": progress.total_seconds}
         row |= {f"time/{phase}": progress.seconds[phase] for phase in PHASES}
         row["time/env_steps_per_second"] = steps / max(seconds, 1e-9)
-        if row["train/loss"] is not None and not math.isfinite(row["train/loss"]):
-            raise FloatingPointError(
-                f"the loss is {row['train/loss']} at step {progress.env_steps}; the last checkpoint is of step "
-                f"{self._saved_at}; a smaller learner.learning_rate may help"
-            )
+        self._refuse_non_finite()
         self._write("metrics", lambda: self.folder.append_metrics(row))
         self.state = TrainState(actors.replace(tally=actors.tally.begin_report()), learning.begin_report())
         self._logged_at = (progress.env_steps, progress.total_seconds)
         share = progress.share_done(self.config)
         self.console.update(row, share=share, eta=self._seconds_left(share))
+
+    def _refuse_non_finite(self) -> None:
+        """Raise before a loss that is not finite is logged or saved; it stays in the sum, so none is missed."""
+        loss = float(self.state.learning.metrics["train/loss"])
+        if not math.isfinite(loss):
+            raise FloatingPointError(
+                f"the loss is {loss} at step {self.progress.env_steps}; the last checkpoint is of step "
+                f"{self._saved_at}; a smaller learner.learning_rate may help"
+            )
 
     def evaluate(self) -> None:
         """Measure the policy on the validation scenes, and keep it if it is the best (of equals, the newest)."""
@@ -202,7 +208,7 @@ class Trainer:
         params = self.state.learning.learner.params
         with progress.timed("evaluate"):
             measured = self.evaluate_fn(params)
-        self._saved_at = -1  # the best score is part of a checkpoint
+        self._unsaved = True  # the best score is part of a checkpoint
         where = {"env_steps": progress.env_steps, "episodes": progress.episodes}
         row = where | {f"eval/{name}": value for name, value in measured.items()}
         self._write("metrics", lambda: self.folder.append_metrics(row))
@@ -215,8 +221,9 @@ class Trainer:
     def save(self) -> None:
         """Write a checkpoint, unless this step has one."""
         progress = self.progress
-        if self._saved_at == progress.env_steps:
+        if self.saved:
             return
+        self._refuse_non_finite()
         rest, _ = self.state.split()
         ring, extra = self.state.ring(), dict(vars(progress))
         with progress.timed("checkpoint"):
@@ -226,12 +233,12 @@ class Trainer:
             )
         self._tried_to_save_at = progress.total_seconds
         if written:
-            self._saved_at = progress.env_steps
+            self._saved_at, self._unsaved = progress.env_steps, False
 
     @property
     def saved(self) -> bool:
         """Whether the current step has a checkpoint."""
-        return self._saved_at == self.progress.env_steps
+        return self._saved_at == self.progress.env_steps and not self._unsaved
 
     def _write(self, what: str, write: Callable[[], object]) -> bool:
         """Write a file; a full disk is reported, and the training goes on. Return whether it was written."""
