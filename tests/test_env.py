@@ -98,6 +98,9 @@ CASES = {
     ),
     "obstacle tilted by 0.71": Case(BOTTLE, ("ycb_wood_block", falling(0.0, 0.1, 0.71)), reward=0.5),
     "target at the palm": Case(CAN_AT_PALM, BLOCK, reason="target_in_region", reward=2.0),
+    "target between the fingers after the push": Case(
+        ("kit_salt_cylinder", pose(CAN_AT_PALM[1][0] + 0.054, 0.0)), BLOCK, reason="target_in_region", reward=2.0
+    ),
     "obstacle at the palm": Case(BOTTLE, CAN_AT_PALM, reason="obstacle_in_region"),
     # The fingers squeeze the can about 1 mm nearer to the palm, so that this reward is left open.
     "target at the palm of a closing hand": Case(CAN_AT_PALM, BLOCK, (50, 0, CLOSED), reward=None),

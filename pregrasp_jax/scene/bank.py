@@ -154,7 +154,7 @@ def build(
         target=target.astype(np.int32),
         seeds=seeds,
         split=split,
-        tries=tries,
+        tries=int(seeds[-1]) + 1,
         content_hash=bank_hash(bank, config, split),
     )
 
