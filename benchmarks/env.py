@@ -16,18 +16,20 @@ import functools
 import json
 import multiprocessing
 import os
+import tempfile
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import IO, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from pregrasp_jax import grid, heightmap, primitives
 from pregrasp_jax.config import PRESETS
 from pregrasp_jax.env import Env, make_env
-from pregrasp_jax.types import CLOSED, MAX_HULLS, OPEN, EnvState
+from pregrasp_jax.types import CLOSED, OPEN, EnvState
 
 LENGTHS = (0.05, 0.15)
 """m; push lengths are uniform in this range, 0.1 m on average."""
@@ -139,6 +141,7 @@ def timed(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
 
 def pybullet_worker(num_steps: int, seed: int, queue: Any) -> None:
     """Push through the same packed scenes with a floating hand in PyBullet; put steps and seconds on the queue."""
+    os.dup2(2, 1)  # PyBullet greets on standard output, where only the JSON belongs
     import pybullet as p  # pyright: ignore[reportMissingImports]
 
     env = make_env(PRESETS["cpu"], split="validation", threads=1)
@@ -167,22 +170,32 @@ def pybullet_scene(p: Any, env: Env, index: int) -> int:
     p.setTimeStep(1 / 240)
     plane = p.createMultiBody(0, p.createCollisionShape(p.GEOM_BOX, halfExtents=[2, 2, 0.05]), -1, [0, 0, -0.05])
     p.changeDynamics(plane, -1, lateralFriction=0.1)
-    vertices, hulls = np.asarray(env.bank.full.vertices), np.asarray(env.bank.object_hulls)
     for obj, pose in zip(env.scenes.object_ids[index], env.scenes.poses[index], strict=True):
         if obj < 0:
             continue
-        ids = [h for h in hulls[obj][:MAX_HULLS] if h >= 0]
-        points = [np.unique(vertices[h], axis=0).tolist() for h in ids]
-        shape = p.createCollisionShapeArray(shapeTypes=[p.GEOM_MESH] * len(ids), vertices=points)
-        com = np.asarray(env.bank.com[obj]).tolist()
+        with tempfile.NamedTemporaryFile("w", suffix=".obj") as file:
+            write_obj(file, env, obj)
+            shape = p.createCollisionShape(p.GEOM_MESH, fileName=file.name)
         x, y, z, qw, qx, qy, qz = pose.tolist()
-        body = p.createMultiBody(
-            float(env.bank.mass[obj]), shape, -1, [x, y, z], [qx, qy, qz, qw], baseInertialFramePosition=com
-        )
+        centre = [x, y, z + float(env.bank.com[obj, 2])]
+        body = p.createMultiBody(float(env.bank.mass[obj]), shape, -1, centre, [qx, qy, qz, qw])
         p.changeDynamics(body, -1, lateralFriction=0.5)
     box = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.05, 0.06, 0.02])
     hand = p.createMultiBody(1.0, box, -1, [-0.30, 0, 0.1])
     return p.createConstraint(hand, -1, -1, -1, p.JOINT_FIXED, [0, 0, 0], [0, 0, 0], [-0.30, 0, 0.1])
+
+
+def write_obj(file: IO[str], env: Env, obj: int) -> None:
+    """Write the hulls of an object about its centre of mass; Bullet makes one convex shape of each group."""
+    hulls = np.asarray(env.bank.object_hulls[obj])
+    offset = 1
+    for hull in hulls[hulls >= 0]:
+        points = np.unique(np.asarray(env.bank.full.vertices[hull] - env.bank.com[obj]), axis=0)
+        faces = ConvexHull(points).simplices + offset
+        file.write(f"o hull_{hull}\n" + "".join("v {} {} {}\n".format(*point) for point in points))
+        file.writelines("f {} {} {}\n".format(*face) for face in faces)
+        offset += len(points)
+    file.flush()
 
 
 def pybullet_push(p: Any, hand: int, start: np.ndarray, offset: np.ndarray) -> np.ndarray:
@@ -202,9 +215,11 @@ def compare_pybullet(num_steps: int) -> float:
     workers = [context.Process(target=pybullet_worker, args=(num_steps, seed, queue)) for seed in range(2)]
     for worker in workers:
         worker.start()
-    rates = [done / elapsed for done, elapsed in (queue.get(timeout=600) for _ in workers)]
     for worker in workers:
         worker.join()
+        if worker.exitcode:
+            raise RuntimeError("a PyBullet process failed; its error is above")
+    rates = [done / elapsed for done, elapsed in (queue.get() for _ in workers)]
     return float(sum(rates))
 
 
