@@ -210,18 +210,13 @@ def make_env(
         ValueError: the objects or settings cannot be used; one line says why.
     """
     threads = config.physics.threads if threads is None else threads
+    _refuse_empty_ring(config.task)
     bank = load_bank_for(config.assets.object_dir, config.assets.object_set)
     engine = make_engine(config.physics.engine, bank, threads=threads)
     scenes = scene_bank.load_or_build(bank, config.scene, split, threads=threads, progress=progress)
     guided = config.exploration.guided
     max_distance = config.task.r_out if guided else float(np.hypot(0.5, 0.5) + 0.1)
-    env = Env(task=config.task, bank=bank, scenes=scenes, engine=engine, max_distance=max_distance)
-    if not env.action_mask(jnp.asarray(robot.START_POSE[:2], jnp.float32)).any():
-        raise ValueError(
-            f"task.r_out = {config.task.r_out} leaves no cell of the workspace within reach of the start pose "
-            f"(x = {robot.START_POSE[0]} m); allowed is 0.06 or more"
-        )
-    return env
+    return Env(task=config.task, bank=bank, scenes=scenes, engine=engine, max_distance=max_distance)
 
 
 def with_task(env: Env, **changes: object) -> Env:
@@ -240,3 +235,12 @@ def _turn(pose: jax.Array, *, yaw: jax.Array) -> jax.Array:
 def _distance(state: EnvState) -> jax.Array:
     """Return the planar distance [MAX_OBJECTS] m from each centroid to the grasp point."""
     return jnp.linalg.norm(state.centroids - state.physics_obs.hand_pose[None, :2], axis=-1)
+
+
+def _refuse_empty_ring(task: TaskConfig) -> None:
+    start = jnp.asarray(robot.START_POSE[:2], jnp.float32)
+    if not primitives.half_ring_mask(start, r_in=task.r_in, r_out=task.r_out, full_ring=task.full_ring).any():
+        raise ValueError(
+            f"task.r_in = {task.r_in} and task.r_out = {task.r_out} leave no cell of the workspace around the start "
+            f"pose (x = {robot.START_POSE[0]} m); allowed is a ring at least 0.01 m wide that reaches 0.06 m"
+        )

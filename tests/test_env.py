@@ -407,7 +407,7 @@ def test_pushes_are_planned_as_long_as_exploration_needs_them(guided, longest):
 
 
 def test_settings_that_cannot_work_are_refused(monkeypatch):
-    with pytest.raises(ValueError, match=r"task\.r_out = 0\.05 leaves no cell .*; allowed is 0\.06 or more"):
+    with pytest.raises(ValueError, match=r"task\.r_out = 0\.05 leave no cell .*; allowed is a ring"):
         make_env(Config(scene=SceneConfig(test_scenes=3), task=TaskConfig(r_out=0.05)), split="test")
     make_env(Config(scene=SceneConfig(test_scenes=3), task=TaskConfig(r_out=0.06)), split="test")
     monkeypatch.setattr(env_module.scene_bank, "load_or_build", lambda *_, **__: pytest.fail("packed too early"))
