@@ -151,11 +151,14 @@ def pybullet_worker(num_steps: int, seed: int, queue: Any) -> None:
     p.connect(p.DIRECT)
     elapsed, done = 0.0, 0
     while done < num_steps:
-        hand = pybullet_scene(p, env, int(rng.integers(len(env.scenes))))
+        index = int(rng.integers(len(env.scenes)))
+        hand = pybullet_scene(p, env, index)
+        target = env.scenes.poses[index, env.scenes.target[index], :2]
         position = np.array([-0.30, 0.0, 0.1])
         start = time.perf_counter()
         for _ in range(3):
-            angle, length = rng.normal(0, 0.5), rng.uniform(*LENGTHS)
+            aim = np.arctan2(*(target - position[:2])[::-1])
+            angle, length = rng.normal(aim, 0.5), rng.uniform(*LENGTHS)
             position = pybullet_push(p, hand, position, length * np.array([np.cos(angle), np.sin(angle), 0.0]))
             p.getCameraImage(640, 480, view, projection, renderer=p.ER_TINY_RENDERER)
             done += 1
@@ -176,9 +179,10 @@ def pybullet_scene(p: Any, env: Env, index: int) -> int:
         with tempfile.NamedTemporaryFile("w", suffix=".obj") as file:
             write_obj(file, env, obj)
             shape = p.createCollisionShape(p.GEOM_MESH, fileName=file.name)
+            seen = p.createVisualShape(p.GEOM_MESH, fileName=file.name)  # without it the renderer draws nothing
         x, y, z, qw, qx, qy, qz = pose.tolist()
         centre = [x, y, z + float(env.bank.com[obj, 2])]
-        body = p.createMultiBody(float(env.bank.mass[obj]), shape, -1, centre, [qx, qy, qz, qw])
+        body = p.createMultiBody(float(env.bank.mass[obj]), shape, seen, centre, [qx, qy, qz, qw])
         p.changeDynamics(body, -1, lateralFriction=0.5)
     box = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.05, 0.06, 0.02])
     hand = p.createMultiBody(1.0, box, -1, [-0.30, 0, 0.1])
