@@ -52,6 +52,17 @@ def test_simplified_cylinder_lies_inside_and_keeps_its_volume_and_base(topology,
     assert (kept[:, 2] == 0.0).sum() >= 8
 
 
+def test_rounding_does_not_choose_among_equally_far_points():
+    """Processors differ in the last bits of a product, and a symmetric shape is full of ties."""
+    angle = 2 * np.pi * np.arange(256) / 256
+    circle = 0.04 * np.column_stack([np.cos(angle), np.sin(angle)])
+    points = np.concatenate([np.column_stack([circle, np.full(256, z)]) for z in (0.0, 0.2)])
+    expected = simplify(points, 32, 12)
+    for seed in range(5):
+        noise = np.random.default_rng(seed).normal(scale=1e-15, size=points.shape) * (points != 0.0)
+        np.testing.assert_allclose(simplify(points + noise, 32, 12), expected, atol=1e-12)
+
+
 def test_a_point_under_the_base_ring_is_not_lost():
     """Decoy: choosing the ring first must not keep the hull from growing below or beside it."""
     points = np.concatenate([cylinder(), [[0.09, 0.0, 0.1]]])

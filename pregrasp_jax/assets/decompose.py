@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 from pregrasp_jax.assets.hulls import BASE_RING, simplify, volume
 from pregrasp_jax.types import FULL_TOPOLOGY, MAX_HULLS
 
-VERSION = 1
+VERSION = 2
 """Part of every cache key; to be raised whenever the same mesh would give other parts."""
 
 BASE_BAND = 0.004
@@ -122,6 +122,7 @@ def _solid_parts(parts: list[np.ndarray]) -> tuple[np.ndarray, ...]:
     volumes = np.array([volume(part) for part in parts])
     if not volumes.any():
         raise ValueError("the mesh encloses no volume")
-    order = np.argsort(-volumes, kind="stable")
+    # Rounded, because which of two equal parts has the larger last bits depends on the processor.
+    order = np.argsort(-np.round(volumes / volumes.sum(), 6), kind="stable")
     keep = [i for i in order if volumes[i] > _MIN_PART * volumes.sum()]
     return tuple(simplify(parts[i], FULL_TOPOLOGY[0], BASE_RING[FULL_TOPOLOGY]) for i in keep)

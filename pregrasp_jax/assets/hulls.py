@@ -23,6 +23,9 @@ TOLERANCE = 1e-4
 MIN_THICKNESS = 5e-4
 """m; a point set thinner than this in some direction is flat and has no hull."""
 
+_TIE = 1e-9
+"""m; distances nearer than this are equal: they differ by the last bits, and those by processor."""
+
 _COPLANAR = 1e-6
 """Neighbouring triangles are one face if neither normal (unitless) nor offset (m) differ by more."""
 
@@ -91,7 +94,9 @@ def make_hulls(parts: Sequence[np.ndarray], topology: tuple[int, int, int]) -> H
         The M hulls, padded by repeating the last vertex, face and edge. Float32 rounding moves a vertex by less
         than 1e-8 m.
     """
-    solids = [polytope(simplify(part, topology[0], BASE_RING[topology])) for part in parts]
+    kept = [simplify(part, topology[0], BASE_RING[topology]) for part in parts]
+    # Rounded before the faces are built, so that these do not depend on the last bits of a processor either.
+    solids = [polytope(points.astype(np.float32).astype(np.float64)) for points in kept]
     return Hulls(
         vertices=jnp.asarray(np.stack([_pad(s.vertices, topology[0]) for s in solids]), jnp.float32),
         planes=jnp.asarray(np.stack([_pad(s.planes, topology[1]) for s in solids]), jnp.float32),
@@ -110,7 +115,7 @@ def _insert_farthest(points: np.ndarray, start: list[int], budget: int) -> list[
     while len(kept) < budget:
         equations = ConvexHull(points[kept]).equations
         outside = (points @ equations[:, :-1].T + equations[:, -1]).max(axis=1)
-        farthest = int(outside.argmax())
+        farthest = _first_largest(outside)
         if outside[farthest] < TOLERANCE:
             break
         kept.append(farthest)
@@ -119,7 +124,7 @@ def _insert_farthest(points: np.ndarray, start: list[int], budget: int) -> list[
 
 def _spanning_set(points: np.ndarray, start: list[int]) -> list[int]:
     """Add points to `start` until they span all dimensions, each the farthest from the span so far."""
-    kept = list(start) or [int(points[:, -1].argmin())]
+    kept = list(start) or [_first_largest(-points[:, -1])]
     while True:
         offsets = points - points[kept[0]]
         _, sizes, axes = np.linalg.svd(offsets[kept], full_matrices=False)
@@ -129,7 +134,12 @@ def _spanning_set(points: np.ndarray, start: list[int]) -> list[int]:
         distance = np.linalg.norm(offsets - offsets @ axes.T @ axes, axis=1)
         if distance.max() < MIN_THICKNESS:
             raise ValueError(f"{len(points)} points are flat: thinner than {MIN_THICKNESS * 1e3:g} mm")
-        kept.append(int(distance.argmax()))
+        kept.append(_first_largest(distance))
+
+
+def _first_largest(values: np.ndarray) -> int:
+    """Return the first of the largest values [P], m; on symmetric shapes rounding must not choose among equals."""
+    return int(np.argmax(values >= values.max() - _TIE))
 
 
 def _is_solid(points: np.ndarray) -> bool:
