@@ -244,7 +244,7 @@ def test_table_names_objects_and_refusals():
     table = format_table(bank, [Refusal("x.stl", "too low")]).splitlines()
     assert table[0].split() == ["object", "hulls", "size", "[mm]", "mass", "[kg]", "target"]
     chips = next(line for line in table if line.startswith("ycb_chips_can"))
-    assert chips.split()[1:] == ["1", "77", "x", "77", "x", "250", "0.205", "yes"]
+    assert chips.split()[1:] == ["1", "77", "x", "76", "x", "250", "0.205", "yes"]
     pitcher = next(line for line in table if line.startswith("ycb_pitcher"))
     assert "no: narrowest width" in pitcher
     assert table[-2].startswith("17 objects, ")
