@@ -90,7 +90,7 @@ def measure(width: float, batch: Batch, *, repetitions: int, seconds: float) -> 
             learner.update,
             apply_fn=apply_fn,
             q_at_fn=q_at_fn,
-            mask_fn=functools.partial(half_ring_mask, r_in=0.04, r_out=0.15),
+            mask_fn=functools.partial(half_ring_mask, r_in=0.04, r_out=0.2),
             optimizer=optimizer,
         ),
         donate_argnums=0,

@@ -65,8 +65,8 @@ def test_what_is_wrong_is_named_with_what_is_allowed(values, said):
 
 
 def test_settings_that_contradict_each_other():
-    with pytest.raises(ValueError, match=r"task.r_in = 0.2 must be below task.r_out = 0.15"):
-        from_dict({"task": {"r_in": 0.2}}).validate()
+    with pytest.raises(ValueError, match=r"task.r_in = 0.3 must be below task.r_out = 0.2"):
+        from_dict({"task": {"r_in": 0.3}}).validate()
     with pytest.raises(ValueError, match=r"scene.min_objects = 8 must not exceed scene.max_objects = 5"):
         from_dict({"scene": {"min_objects": 8, "max_objects": 5}}).validate()
 

@@ -9,6 +9,7 @@ import pytest
 from fake_env import UNREACHABLE_ROWS, fake_env, make_scenes
 
 from pregrasp_jax import grid, policies
+from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.judge import TARGET_IN_REGION
 from pregrasp_jax.types import CLOSED, OPEN, REASONS, EnvState, Observation
 
@@ -43,7 +44,7 @@ def test_straight_ends_in_the_half_ring_nearest_to_the_target(
     axis = -0.25 + 0.005 * (np.arange(100) + 0.5)
     cells = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     radius = np.linalg.norm(cells - p1, axis=1)
-    ring = cells[(radius >= 0.04 - 1e-6) & (radius <= 0.15 + 1e-6) & (cells[:, 0] >= p1[0] - 1e-6)]
+    ring = cells[(radius >= 0.04 - 1e-6) & (radius <= 0.2 + 1e-6) & (cells[:, 0] >= p1[0] - 1e-6)]
     best = np.linalg.norm(ring - target, axis=1).min()
     assert np.linalg.norm(end - target) == pytest.approx(best, abs=1e-5)
     assert np.linalg.norm(ring - end, axis=1).min() < 1e-5
@@ -130,8 +131,7 @@ def _world(xy: list[tuple[float, float]]) -> Any:
     scenes = make_scenes(1)
     scenes.xy[0, :3] = xy
     scenes.target[0] = 1
-    env = fake_env(scenes=scenes)
-    return env
+    return fake_env(scenes=scenes, task=TaskConfig(r_out=0.15))
 
 
 def test_lookahead_succeeds_where_straight_encloses_the_obstacle(key: jax.Array) -> None:
