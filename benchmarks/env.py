@@ -116,7 +116,7 @@ def compile_stages(env: Env) -> dict[str, Callable[..., Any]]:
         return env.engine.run(state.physics, plan.ctrl, jnp.where(plan.reachable, plan.num_ctrl, 0))
 
     def look(state: EnvState) -> Any:
-        return heightmap.observe(heightmap.scene_hulls(env.bank, state.scene, state.physics_obs))
+        return heightmap.observe(heightmap.scene_hulls(env.bank, state.scene, state.physics_obs), state.p1)
 
     stages = {"action": sample_action, "plan": plan, "physics": physics, "heightmap": look}
     return {name: jax.jit(jax.vmap(function)) for name, function in stages.items()}

@@ -22,9 +22,11 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from pregrasp_jax.config import NetworkConfig, TaskConfig
 from pregrasp_jax.grid import GRID_SIZE
 from pregrasp_jax.learning import learner
-from pregrasp_jax.learning.networks import QNetwork, num_parameters, q_functions
+from pregrasp_jax.learning.networks import num_parameters
+from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.learning.replay import Batch
 from pregrasp_jax.primitives import half_ring_mask
 
@@ -79,17 +81,16 @@ def random_batch(key: jax.Array, batch_size: int) -> Batch:
 
 def measure(width: float, batch: Batch, *, repetitions: int, seconds: float) -> dict[str, float]:
     """Return ms per sample of forward and update, and the number of parameters."""
-    network = QNetwork(width=width)
-    params = jax.jit(network.init)(jax.random.key(0), batch.inputs[:1])
-    apply_fn, q_at_fn = q_functions(network)
-    forward = jax.jit(apply_fn)
+    q = make_q_function(NetworkConfig(width=width), TaskConfig())
+    params = jax.jit(q.init)(jax.random.key(0))
+    forward = jax.jit(q.apply)
     optimizer = optax.adam(1e-4)
     state = learner.init(params, optimizer)
     update = jax.jit(
         functools.partial(
             learner.update,
-            apply_fn=apply_fn,
-            q_at_fn=q_at_fn,
+            apply_fn=q.apply,
+            q_at_fn=q.of_action,
             mask_fn=functools.partial(half_ring_mask, r_in=0.04, r_out=0.2),
             optimizer=optimizer,
         ),

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 Engine = Literal["native", "mjx", "warp"]
 Camera = Literal["orthographic", "pinhole"]
+Architecture = Literal["paper", "compact"]
 ObjectSet = Literal["seen", "unseen"]
 
 
@@ -75,10 +76,14 @@ class PhysicsConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig:
-    """The Q-network of Fig. 3."""
+    """The Q-network."""
 
+    architecture: Architecture = "paper"
+    """`paper`: Fig. 3 on the whole grid; `compact`: 2 cm patches of a window around the hand, for CPUs."""
     width: float = 1.0
-    """Factor on all channel counts; 1.0 is the paper's 7.4 M parameters, 0.25 has 0.46 M."""
+    """Factor on all channel counts; 1.0 is the paper's 7.4 M parameters, 0.25 has 0.46 M (compact: 0.08 M)."""
+    initial_bias: float = 0.0
+    """Q-value of every push before training."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,6 +208,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "task.push_speed": (0.02, 1.0),
     "physics.threads": (0, 1024),
     "network.width": (1 / 32, 4.0),
+    "network.initial_bias": (-4.0, 4.0),
     "replay.capacity": (64, 10_000_000),
     "replay.priority_exponent": (0.0, 1.0),
     "replay.importance_exponent": (0.0, 1.0),

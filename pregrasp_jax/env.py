@@ -144,15 +144,16 @@ class Env:
         """Return any scene with the open hand at the start; `index` is its row of the bank, -1 for none."""
         blank = jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8)
         physics = self.engine.reset(self.engine.init(), scene)
+        p1 = jnp.asarray(robot.START_POSE[:2], jnp.float32)
         return self._look(
             EnvState(
                 physics=physics,
                 scene=scene,
                 scene_index=jnp.int32(index),
                 physics_obs=self.engine.observe(physics),
-                obs=Observation(blank, blank),
+                obs=Observation(blank, blank, p1),
                 centroids=jnp.zeros((MAX_OBJECTS, 2)),
-                p1=jnp.asarray(robot.START_POSE[:2], jnp.float32),
+                p1=p1,
                 aperture=jnp.int32(OPEN),
                 num_pushes=jnp.int32(0),
             )
@@ -170,7 +171,7 @@ class Env:
         hulls = heightmap.scene_hulls(self.bank, state.scene, physics_obs)
         com = jnp.asarray(self.bank.com)[state.scene.object_ids]
         centroids = jax.vmap(geometry.transform_points)(physics_obs.object_poses, com)[:, :2]
-        obs = heightmap.observe(hulls, camera=self.task.camera)
+        obs = heightmap.observe(hulls, state.p1, camera=self.task.camera)
         return state.replace(physics_obs=physics_obs, obs=obs, centroids=centroids)
 
     def _coverage(self, physics_obs: PhysicsObservation, scene: SceneParams, aperture: jax.Array) -> jax.Array:

@@ -136,8 +136,7 @@ def _push(env: Env, state: EnvState, action: jax.Array, depth: int) -> tuple[Env
 
 def make_learned(
     env: Env,
-    q_values: Callable[[Any, jax.Array], jax.Array],
-    network_input: Callable[[Observation, jax.Array], jax.Array],
+    q_values: Callable[[Any, Observation, jax.Array], jax.Array],
 ) -> Callable[[Any], Policy]:
     """Return the constructor params -> policy of greedy pushes inside the half ring.
 
@@ -145,13 +144,12 @@ def make_learned(
 
     Args:
         env: says which cells are allowed.
-        q_values: (params, images [H, W, 2]) -> Q [H, W, 2].
-        network_input: (observation, target slot) -> images [H, W, 2].
+        q_values: (params, observation, target slot) -> Q [H, W, 2].
     """
 
     def act(params: Any, state: EnvState, key: jax.Array) -> jax.Array:
         del key
-        q = q_values(params, network_input(state.obs, state.scene.target))
+        q = q_values(params, state.obs, state.scene.target)
         return jnp.argmax(jnp.where(env.action_mask(state.p1)[..., None], q, -jnp.inf)).astype(jnp.int32)
 
     return lambda params: Partial(act, params)

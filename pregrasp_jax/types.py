@@ -127,15 +127,17 @@ class PhysicsObservation(struct.PyTreeNode):
 
 
 class Observation(struct.PyTreeNode):
-    """What a camera above the table sees, on the grid; row = y, col = x.
+    """What a camera above the table sees, on the grid (row = y, col = x), and where the hand was sent.
 
     Attributes:
         height: [H, W] uint8, 0 to 255 for 0 to 0.30 m above the table (see `grid.quantize_height`).
         instance_ids: [H, W] uint8, `TABLE_ID`, slot + 1, or `ROBOT_ID`.
+        p1: [2] float32 m, commanded end of the last push.
     """
 
     height: jax.Array
     instance_ids: jax.Array
+    p1: jax.Array
 
 
 class Outcome(struct.PyTreeNode):

@@ -90,7 +90,8 @@ def test_q_map_draws_the_push_where_it_is():
 
 def test_panel_draws_the_push_on_the_map_of_its_aperture():
     hulls = make_instances([box_cloud((0.0, -0.02, 0), (0.05, 0.02, 0.12))], [1])
-    obs = Observation(height=jnp.zeros((100, 100), jnp.uint8), instance_ids=jnp.zeros((100, 100), jnp.uint8))
+    blank = jnp.zeros((100, 100), jnp.uint8)
+    obs = Observation(height=blank, instance_ids=blank, p1=jnp.zeros(2))
     mask = np.zeros((100, 100), bool)
     mask[40:60, 20:40] = True
     action = int(grid.encode_action(jnp.int32(50), jnp.int32(35), jnp.int32(OPEN)))

@@ -15,7 +15,7 @@ from pregrasp_jax import grid, policies
 from pregrasp_jax.config import Config, SceneConfig, TaskConfig
 from pregrasp_jax.env import make_env
 from pregrasp_jax.evaluation import Episode, EvaluationResult, Evaluator, evaluate_policy, results
-from pregrasp_jax.types import OPEN, REASONS, EnvState
+from pregrasp_jax.types import OPEN, REASONS, EnvState, Observation
 
 ENV = fake_env()
 
@@ -134,11 +134,12 @@ def test_progress_counts_every_episode_once() -> None:
 def test_new_parameters_do_not_compile_again() -> None:
     traces = []
 
-    def q_values(params: jax.Array, images: jax.Array) -> jax.Array:
+    def q_values(params: jax.Array, obs: Observation, target: jax.Array) -> jax.Array:
+        del target
         traces.append(1)
-        return params * images
+        return params * jnp.ones((*obs.height.shape, 2))
 
-    make = policies.make_learned(ENV, q_values, lambda obs, target: jnp.ones((*obs.height.shape, 2)))
+    make = policies.make_learned(ENV, q_values)
     evaluator = Evaluator(ENV, num_envs=3)
     for scale in (1.0, 2.0):
         evaluator.run(make(jnp.float32(scale)), episodes=5)

@@ -129,18 +129,20 @@ def test_observe_quantizes_and_refuses_unknown_cameras(bank, key):
     hulls = make_instances(
         [box_cloud((0.05, 0.05, 0), (0.11, 0.11, 0.06)), box_cloud((0, 0, 0.4), (0.04, 0.04, 0.5))], [1, 2]
     )
-    obs = jax.jit(heightmap.observe)(hulls)
+    hand = jnp.array([-0.1, 0.02])
+    obs = jax.jit(heightmap.observe)(hulls, hand)
+    np.testing.assert_array_equal(obs.p1, hand)
     assert obs.height.dtype == obs.instance_ids.dtype == jnp.uint8
     assert obs.height[65, 65] == 51 and obs.instance_ids[65, 65] == 1  # 0.06 m of 0.30 m in 255 steps
     assert obs.height[54, 54] == 255 and obs.instance_ids[54, 54] == 2
-    through_pinhole = jax.jit(functools.partial(heightmap.observe, camera="pinhole"))(hulls)
+    through_pinhole = jax.jit(functools.partial(heightmap.observe, camera="pinhole"))(hulls, hand)
     # A surface at 0.5 m seen from 1 m stays over its own cells: its points are unprojected with their depth.
     np.testing.assert_array_equal(through_pinhole.instance_ids[66:71, 66:71], 1)
     np.testing.assert_array_equal(through_pinhole.instance_ids[51:57, 51:57], 2)
-    same = jax.jit(lambda h, camera: heightmap.observe(h, camera=camera))(hulls, heightmap.overhead_camera())
+    same = jax.jit(lambda h, camera: heightmap.observe(h, hand, camera=camera))(hulls, heightmap.overhead_camera())
     np.testing.assert_array_equal(same.height, through_pinhole.height)
     with pytest.raises(ValueError, match="camera 'fisheye' is unknown; allowed are orthographic, pinhole"):
-        heightmap.observe(hulls, camera="fisheye")
+        heightmap.observe(hulls, hand, camera="fisheye")
 
 
 def test_overhead_camera_is_the_one_of_the_mjcf():
@@ -165,13 +167,11 @@ def test_fused_segmentation_by_hand():
 
 def test_network_input_by_hand():
     # Heights 0, 0, 0, 0.30 m: mean 0.075, standard deviation (of the population) 0.1299.
-    obs = Observation(
-        height=jnp.array([[0, 0], [0, 255]], jnp.uint8), instance_ids=jnp.array([[0, 9], [1, 2]], jnp.uint8)
-    )
+    obs = Observation(jnp.array([[0, 0], [0, 255]], jnp.uint8), jnp.array([[0, 9], [1, 2]], jnp.uint8), jnp.zeros(2))
     image = heightmap.network_input(obs, jnp.int32(1))
     np.testing.assert_allclose(image[..., 0], [[-0.57735, -0.57735], [-0.57735, 1.73205]], atol=1e-4)
     np.testing.assert_allclose(image[..., 1], [[0, 1], [1 / 3, 2 / 3]], atol=1e-6)
-    flat = Observation(height=jnp.full((4, 4), 100, jnp.uint8), instance_ids=jnp.zeros((4, 4), jnp.uint8))
+    flat = Observation(jnp.full((4, 4), 100, jnp.uint8), jnp.zeros((4, 4), jnp.uint8), jnp.zeros(2))
     np.testing.assert_allclose(heightmap.network_input(flat, jnp.int32(0)), 0.0, atol=1e-4)
     # Below the floor of 1 mm: one quantum of 1.18 mm in one of 16 cells has a deviation of 0.28 mm.
     bump = heightmap.network_input(flat.replace(height=flat.height.at[0, 0].add(1)), jnp.int32(0))

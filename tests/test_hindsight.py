@@ -101,7 +101,7 @@ def test_enclosed_obstacle(coverage, flags, eligible, expected):
 
 def image(number: int) -> Observation:
     pixels = jnp.array([[number % 256, number // 256]], jnp.uint8)
-    return Observation(pixels, pixels)
+    return Observation(pixels, pixels, jnp.zeros(2))
 
 
 def test_jitted_memory_agrees_with_a_plain_loop_over_the_shipped_judge():

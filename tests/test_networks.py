@@ -12,12 +12,11 @@ from pregrasp_jax.learning.networks import (
     interpolation_weights,
     max_pool,
     num_parameters,
-    q_functions,
     upsample,
 )
 
 TINY = QNetwork(width=1 / 16, initial_bias=0.7)
-APPLY, Q_AT = map(jax.jit, q_functions(TINY))
+APPLY, Q_AT = jax.jit(TINY.apply), jax.jit(functools.partial(TINY.apply, method="q_of_action"))
 
 
 @functools.cache
@@ -200,7 +199,7 @@ def test_activations_keep_their_scale_without_normalisation():
 def test_bfloat16_computes_and_returns_float32():
     x = jax.random.normal(jax.random.key(0), (1, 100, 100, 2))
     half = QNetwork(width=1 / 16, dtype=jnp.bfloat16)
-    q, reference = jax.jit(q_functions(half)[0])(tiny_params(), x), APPLY(tiny_params(), x)
+    q, reference = jax.jit(half.apply)(tiny_params(), x), APPLY(tiny_params(), x)
     assert q.dtype == jnp.float32
     assert float(jnp.max(jnp.abs(q - reference))) < 0.1 * float(jnp.max(jnp.abs(reference)))
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(jax.eval_shape(half.init, jax.random.key(0), x)))

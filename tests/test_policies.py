@@ -92,35 +92,33 @@ def test_learned_takes_the_best_allowed_pixel(key: jax.Array) -> None:
     q = jnp.full((100, 100, 2), -5.0)
     q = q.at[rows[1], cols[1], 1].set(9.0).at[outside[0], outside[1], 0].set(8.0)
     q = q.at[rows[0], cols[0], 1].set(-1.0).at[rows[0], cols[0], 0].set(-2.0)
-    make = policies.make_learned(ENV, lambda params, images: params + 0 * images, _blank_input)
+    make = policies.make_learned(ENV, lambda params, obs, target: params)
     chosen = make(q)(state, key)
     assert chosen == grid.encode_action(rows[0], cols[0], jnp.int32(OPEN))
-
-
-def _blank_input(obs: Observation, target: jax.Array) -> jax.Array:
-    return jnp.zeros((*obs.height.shape, 2)) + target
 
 
 def test_learned_sees_its_own_target(key: jax.Array) -> None:
     cell = grid.world_to_cell(jnp.array([0.0, 0.0]))
     state = _state((-0.1, 0.0), (0.0, 0.1))
 
-    def q_values(params: jax.Array, images: jax.Array) -> jax.Array:
+    def q_values(params: jax.Array, obs: Observation, target: jax.Array) -> jax.Array:
+        del obs
         wanted = jnp.zeros((100, 100, 2)).at[cell[0], cell[1], 0].set(1.0)
-        return params * wanted * (images[0, 0, 0] == state.scene.target)
+        return params * wanted * (target == state.scene.target)
 
-    action = policies.make_learned(ENV, q_values, _blank_input)(jnp.float32(1.0))(state, key)
+    action = policies.make_learned(ENV, q_values)(jnp.float32(1.0))(state, key)
     assert action == grid.encode_action(*cell, jnp.int32(CLOSED))
 
 
 def test_policies_of_one_constructor_share_their_compilation(key: jax.Array) -> None:
     traces = []
 
-    def q_values(params: jax.Array, images: jax.Array) -> jax.Array:
+    def q_values(params: jax.Array, obs: Observation, target: jax.Array) -> jax.Array:
+        del target
         traces.append(1)
-        return params * images
+        return params * jnp.ones((*obs.height.shape, 2))
 
-    make = policies.make_learned(ENV, q_values, _blank_input)
+    make = policies.make_learned(ENV, q_values)
     decide = jax.jit(lambda policy, state, key: policy(state, key))
     for scale in (1.0, 2.0, 3.0):
         decide(make(jnp.float32(scale)), ENV.reset_to(0), key)

@@ -23,7 +23,7 @@ OPTIMIZER = optax.sgd(0.5)
 
 def image(state: int) -> Observation:
     pixel = jnp.full((1, 1), state, jnp.uint8)
-    return Observation(pixel, pixel)
+    return Observation(pixel, pixel, jnp.zeros(2))
 
 
 def network_input(obs: Observation, goal: jax.Array) -> jax.Array:

@@ -18,7 +18,7 @@ def image(ids) -> Observation:
     """Observations whose two pixels spell a number below 2^16 in each leaf."""
     ids = np.asarray(ids)
     pixels = jnp.asarray(np.stack([ids % 256, ids // 256], axis=-1)[..., None, :].astype(np.uint8))
-    return Observation(height=pixels, instance_ids=3 * pixels)
+    return Observation(height=pixels, instance_ids=3 * pixels, p1=jnp.zeros((len(pixels), 2)))
 
 
 def read_image(obs: Observation) -> np.ndarray:

@@ -18,6 +18,7 @@ from pregrasp_jax import grid
 from pregrasp_jax.checkpoint import checksum, load_policy
 from pregrasp_jax.config import PRESETS, Config, ExplorationConfig, from_dict, to_dict
 from pregrasp_jax.learning import learner
+from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.training import collect, learn, program, resources
 from pregrasp_jax.training.console import Console, describe, format_time
 from pregrasp_jax.training.run_folder import RunFolder, stored_config
@@ -47,8 +48,8 @@ class PictureEnv(FakeEnv):
         row, col = grid.world_to_cell(points)
         ids = jnp.arange(1, MAX_OBJECTS + 2).astype(jnp.uint8)
         blank = jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8)
-        pictures = Observation(blank.at[row, col].set(100 + ids, mode="drop"), blank.at[row, col].set(ids, mode="drop"))
-        return state.replace(obs=pictures)
+        height, instance_ids = (blank.at[row, col].set(x, mode="drop") for x in (100 + ids, ids))
+        return state.replace(obs=Observation(height, instance_ids, state.p1))
 
 
 def make_config(**train: Any) -> Config:
@@ -79,8 +80,8 @@ class TinyNetwork(nn.Module):
 
 
 def make_program(config: Config, **options: Any) -> program.Program:
-    network = TinyNetwork(width=config.network.width)
-    return program.make_program(PictureEnv(), config, input_fn=input_fn, network=network, **options)
+    q_function = QFunction(TinyNetwork(width=config.network.width), input_fn)
+    return program.make_program(PictureEnv(), config, q_function=q_function, **options)
 
 
 def evaluate(params: Any) -> dict[str, Any]:
@@ -338,7 +339,7 @@ def test_the_learner_measures_what_the_report_prints(monkeypatch):
 
 def test_too_little_memory_or_disk_is_refused_before_the_start(tmp_path, monkeypatch):
     rest, ring = make_program(make_config()).shapes().split()
-    assert resources.num_bytes(ring) == 70 * 2 * 100 * 100
+    assert resources.num_bytes(ring) == 70 * (2 * 100 * 100 + 2 * 4)
     resources.check(rest, ring, tmp_path / "new" / "run")
     assert not (tmp_path / "new").exists()
     monkeypatch.setattr(resources, "available_memory", lambda: 10**6)

@@ -14,8 +14,7 @@ from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.config import AssetsConfig, Camera, Config, PhysicsConfig, SceneConfig
 from pregrasp_jax.env import Env, make_env, with_task
 from pregrasp_jax.evaluation import Evaluator, Progress, evaluation_document
-from pregrasp_jax.heightmap import network_input
-from pregrasp_jax.learning.networks import QNetwork
+from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.policies import Policy
 from pregrasp_jax.training.program import enable_compilation_cache
 
@@ -102,14 +101,10 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     env = make_env(config, split="test", progress=packed)
     if trained is None:
         return Player(_make_script(request.policy, env, config), None, env, config)
-    network = QNetwork(width=config.network.width)
-
-    def q_values(params: Any, images: jax.Array) -> jax.Array:
-        return network.apply({"params": params}, images)  # pyright: ignore[reportReturnType]
-
+    q_function = make_q_function(config.network, config.task)
     return Player(
-        policies.make_learned(env, q_values, network_input)(trained.params),
-        lambda state: q_values(trained.params, network_input(state.obs, state.scene.target)),
+        policies.make_learned(env, q_function.values)(trained.params),
+        lambda state: q_function.values(trained.params, state.obs, state.scene.target),
         env,
         config,
     )

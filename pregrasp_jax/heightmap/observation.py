@@ -55,11 +55,12 @@ def object_hulls(bank: HullBank, object_ids: jax.Array, poses: jax.Array) -> Hul
     return HullInstances(planes=planes, vertices=vertices, labels=labels, present=present.ravel())
 
 
-def observe(hulls: HullInstances, *, camera: str | Camera = "orthographic") -> Observation:
-    """Return what a camera sees.
+def observe(hulls: HullInstances, p1: jax.Array, *, camera: str | Camera = "orthographic") -> Observation:
+    """Return what a policy is told: what a camera sees, and where the hand was sent.
 
     Args:
         hulls: what stands on the table, robot included (unbatched), from `scene_hulls`.
+        p1: [2] m, commanded end of the last push.
         camera: ``orthographic``, ``pinhole`` for the overhead camera of the MJCF, or a pinhole camera.
 
     Raises:
@@ -73,7 +74,7 @@ def observe(hulls: HullInstances, *, camera: str | Camera = "orthographic") -> O
         height, instance_ids = orthographic(hulls)
     else:
         raise ValueError(f"camera '{camera}' is unknown; allowed are orthographic, pinhole, or a heightmap.Camera")
-    return Observation(height=grid.quantize_height(height), instance_ids=instance_ids)
+    return Observation(height=grid.quantize_height(height), instance_ids=instance_ids, p1=p1)
 
 
 def overhead_camera() -> Camera:

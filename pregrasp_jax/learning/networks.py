@@ -8,7 +8,6 @@ the function:
 * The loss looks at a single pixel, so `QNetwork.q_at` computes only that pixel's receptive field below the second MP.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -276,25 +275,6 @@ def _inside(rows: jax.Array, height: int, cols: jax.Array, width: int) -> jax.Ar
     """Return [B, R, S, 1] float32, 1 where cells (rows [B, R], cols [B, S]) lie in an image of [height, width]."""
     row_inside, col_inside = (rows >= 0) & (rows < height), (cols >= 0) & (cols < width)
     return (row_inside[:, :, None] & col_inside[:, None, :])[..., None].astype(jnp.float32)
-
-
-def q_functions(
-    network: QNetwork,
-) -> tuple[Callable[[Any, jax.Array], jax.Array], Callable[[Any, jax.Array, jax.Array], jax.Array]]:
-    """Return what `learner.update` calls `apply_fn` and `q_at_fn`.
-
-    Returns:
-        ``(params, x [B, H, W, 2]) -> [B, H, W, 2]``, all pushes, and ``(params, x, action [B]) -> [B]``, the taken
-        ones.
-    """
-
-    def apply_fn(params: Any, x: jax.Array) -> jax.Array:
-        return jnp.asarray(network.apply(params, x))
-
-    def q_at_fn(params: Any, x: jax.Array, action: jax.Array) -> jax.Array:
-        return jnp.asarray(network.apply(params, x, action, method="q_of_action"))
-
-    return apply_fn, q_at_fn
 
 
 def num_parameters(params: Any) -> int:

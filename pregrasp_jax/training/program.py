@@ -6,18 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import flax.linen as nn
 import flax.struct as struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax import heightmap, io
+from pregrasp_jax import io
 from pregrasp_jax.checkpoint.chunks import Ring
 from pregrasp_jax.config import Config
 from pregrasp_jax.learning.learner import Params
-from pregrasp_jax.learning.networks import QNetwork
-from pregrasp_jax.learning.replay import InputFn
+from pregrasp_jax.learning.q_function import QFunction, make_q_function
 from pregrasp_jax.training.collect import Actors, CollectFn, Environment, Experience, init_actors, make_collect
 from pregrasp_jax.training.learn import (
     Learning,
@@ -100,8 +98,7 @@ def make_program(
     config: Config,
     *,
     params: Params | None = None,
-    input_fn: InputFn = heightmap.network_input,
-    network: nn.Module | None = None,
+    q_function: QFunction | None = None,
 ) -> Program:
     """Return the program of a configuration, not compiled.
 
@@ -109,31 +106,21 @@ def make_program(
         env: the training scenes.
         config: the run.
         params: initial parameters; drawn from the seed if None.
-        input_fn: what the network sees of an observation.
-        network: `QNetwork(width=config.network.width)` if None; it must have `q_of_action` too.
+        q_function: the one of the configuration if None.
 
     Raises:
         ValueError: `params` do not fit the network.
     """
-    network = network or QNetwork(width=config.network.width)
+    q = q_function or make_q_function(config.network, config.task)
     optimizer = make_optimizer(config.learner)
-
-    def apply_fn(params: Params, inputs: jax.Array) -> jax.Array:
-        return network.apply({"params": params}, inputs)  # pyright: ignore[reportReturnType]
-
-    def q_at_fn(params: Params, inputs: jax.Array, action: jax.Array) -> jax.Array:
-        return network.apply({"params": params}, inputs, action, method="q_of_action")  # pyright: ignore[reportReturnType]
-
-    collect = make_collect(env, apply_fn, input_fn, config.exploration, warmup=config.learner.warmup)
+    collect = make_collect(env, q.apply, q.input_fn, config.exploration, warmup=config.learner.warmup)
 
     def init(key: jax.Array) -> TrainState:
         network_key, actor_key, learner_key = jax.random.split(key, 3)
         actors = init_actors(actor_key, env, config.train.num_envs)
-        first = actors.env_states
-        inputs = input_fn(jax.tree.map(lambda leaf: leaf[0], first.obs), first.scene.target[0])
         # XLA's own generator compiles four times faster than threefry, forty kernels long.
         fast_key = jax.random.wrap_key_data(jnp.tile(jax.random.key_data(network_key), 2), impl="rbg")
-        drawn = network.init(fast_key, inputs[None])["params"]
+        drawn = q.init(fast_key)
         experience: Experience = jax.eval_shape(collect, actors, drawn)[1]
         learning = init_learning(
             learner_key,
@@ -146,16 +133,16 @@ def make_program(
         return TrainState(actors, learning)
 
     update = make_update(
-        apply_fn=apply_fn,
-        q_at_fn=q_at_fn,
+        apply_fn=q.apply,
+        q_at_fn=q.of_action,
         mask_fn=env.action_mask,
-        input_fn=input_fn,
+        input_fn=q.input_fn,
         optimizer=optimizer,
         config=config.learner,
         replay_config=config.replay,
     )
     if params is not None:
-        _refuse_misfit(params, network, config)
+        _refuse_misfit(params, q, config)
     return Program(init, collect, make_remember(config.replay), update)
 
 
@@ -167,14 +154,14 @@ def enable_compilation_cache() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 
-def _refuse_misfit(params: Params, network: nn.Module, config: Config) -> None:
-    blank = jax.ShapeDtypeStruct((1, 100, 100, 2), np.float32)
-    expected = jax.eval_shape(network.init, jax.random.key(0), blank)["params"]
+def _refuse_misfit(params: Params, q: QFunction, config: Config) -> None:
+    expected = jax.eval_shape(q.init, jax.random.key(0))
 
     def shapes(tree: Any) -> Any:
         return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
 
     if shapes(params) != shapes(expected):
         raise ValueError(
-            f"the initial parameters are of another network; this run has network.width = {config.network.width}"
+            f"the initial parameters are of another network; this run has network.architecture = "
+            f"{config.network.architecture} and network.width = {config.network.width}"
         )

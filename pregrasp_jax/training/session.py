@@ -3,16 +3,13 @@
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from pregrasp_jax import policies
 from pregrasp_jax.checkpoint.policy import load_policy
 from pregrasp_jax.config import Config
 from pregrasp_jax.env import Env, make_env
 from pregrasp_jax.evaluation import Evaluator
-from pregrasp_jax.heightmap import network_input
 from pregrasp_jax.learning.learner import Params
-from pregrasp_jax.learning.networks import QNetwork
+from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.training import resources
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.interrupt import Interrupt
@@ -80,12 +77,7 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
 
 def make_evaluate(env: Env, config: Config) -> EvaluateFn:
     """Return the function that measures parameters on all scenes of `env`, grasp included; it compiles once."""
-    network = QNetwork(width=config.network.width)
-
-    def q_values(params: Params, images: jax.Array) -> jax.Array:
-        return network.apply({"params": params}, images)  # pyright: ignore[reportReturnType]
-
-    make_policy = policies.make_learned(env, q_values, network_input)
+    make_policy = policies.make_learned(env, make_q_function(config.network, config.task).values)
     episodes = len(env.scenes)
     evaluator = Evaluator(env, num_envs=min(VALIDATION_ENVS, episodes))
 

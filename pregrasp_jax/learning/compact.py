@@ -1,0 +1,166 @@
+"""A Q-network for CPUs: it sees only what surrounds the hand, and computes on 2 cm patches.
+
+The half ring reaches 0.2 m, so a window around the hand holds all that a push can touch, on half of the cells. Inside
+it a patch of 4x4 cells is one position with all of its 16 pixels as channels, and three residual blocks look
+0.14 m in every direction. At 32 channels an update costs an eighth of the paper's network at width 0.25.
+
+Because the window moves with the hand, the network also knows where the hand is while it is still outside the picture.
+"""
+
+import math
+
+import flax.linen as nn
+import flax.struct as struct
+import jax
+import jax.numpy as jnp
+
+from pregrasp_jax import grid
+from pregrasp_jax.config import TaskConfig
+from pregrasp_jax.heightmap import SEGMENTATION, network_input
+from pregrasp_jax.learning.networks import Conv, upsample
+from pregrasp_jax.types import Observation
+
+PATCH = 4
+"""Cells per side of what the network takes for one position."""
+
+_BEHIND, _BESIDE, _BEYOND = 16, 4, 8
+"""Cells of the window behind the hand, and beyond the reach of a push at its sides and ahead of it."""
+
+
+class WindowSize(struct.PyTreeNode):
+    """How far a window reaches from the hand, in cells; all of it is static.
+
+    Attributes:
+        beside: to either side (rows).
+        behind: cols with smaller x.
+        ahead: cols with larger x.
+    """
+
+    beside: int = struct.field(pytree_node=False)
+    behind: int = struct.field(pytree_node=False)
+    ahead: int = struct.field(pytree_node=False)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns, multiples of `PATCH`."""
+        return 2 * self.beside, self.behind + self.ahead
+
+
+class Window(struct.PyTreeNode):
+    """What surrounds the hand.
+
+    Attributes:
+        images: [..., R, C, 3] float32: the two images of `heightmap.network_input`, and 1 inside the workspace;
+            all are 0 outside of it.
+        origin: [..., 2] int32, row and col of the grid where the window begins; may lie outside.
+    """
+
+    images: jax.Array
+    origin: jax.Array
+
+
+def window_size(task: TaskConfig) -> WindowSize:
+    """Return the window that holds every push of a task, whose (half) ring has the radius `r_out`."""
+    reach = math.ceil(task.r_out / grid.HEIGHTMAP_RESOLUTION)
+
+    def padded(cells: int) -> int:
+        return PATCH * math.ceil(cells / PATCH)
+
+    beside = padded(reach + _BESIDE)
+    return WindowSize(beside=beside, behind=beside if task.full_ring else _BEHIND, ahead=padded(reach + _BEYOND))
+
+
+def look_around_hand(obs: Observation, target_slot: jax.Array, *, size: WindowSize) -> Window:
+    """Cut the window around the hand out of an observation (unbatched).
+
+    Args:
+        obs: the observation.
+        target_slot: () int32.
+        size: of the window.
+    """
+    images = network_input(obs, target_slot)
+    images = jnp.concatenate([images, jnp.ones_like(images[..., :1])], axis=-1)
+    # Positions of the hand are cell centres, and the start lies on a corner of cells.
+    row, col = grid.world_to_cell(obs.p1 + 0.01 * grid.HEIGHTMAP_RESOLUTION)
+    origin = jnp.stack([row - size.beside, col - size.behind])
+    rows, cols = size.shape
+    padded = jnp.pad(images, ((rows, rows), (cols, cols), (0, 0)))
+    start = (origin[0] + rows, origin[1] + cols, jnp.int32(0))
+    return Window(jax.lax.dynamic_slice(padded, start, (rows, cols, 3)), origin)
+
+
+def paste(q: jax.Array, origin: jax.Array) -> jax.Array:
+    """Put the values of a window [R, C, 2] at `origin` [2] into the grid: [H, W, 2], 0 outside of the window."""
+    rows, cols = q.shape[:2]
+    blank = jnp.zeros((grid.GRID_SIZE + 2 * rows, grid.GRID_SIZE + 2 * cols, 2), q.dtype)
+    pasted = jax.lax.dynamic_update_slice(blank, q, (origin[0] + rows, origin[1] + cols, jnp.int32(0)))
+    return pasted[rows:-rows, cols:-cols]
+
+
+class CompactNetwork(nn.Module):
+    """Q-values of the pushes inside a window around the hand.
+
+    Attributes:
+        channels: of every layer.
+        blocks: residual blocks.
+        initial_bias: Q-value of every push before training.
+    """
+
+    channels: int = 32
+    blocks: int = 3
+    initial_bias: float = 0.0
+
+    @nn.compact
+    def __call__(self, window: Window) -> jax.Array:
+        """Evaluate the whole grid.
+
+        Args:
+            window: of B scenes.
+
+        Returns:
+            [B, H, W, 2] float32, last axis closed, open; 0 for pushes that end outside the window.
+        """
+        return jax.vmap(paste)(self._q_of_window(window), window.origin)
+
+    @nn.compact
+    def q_of_action(self, window: Window, action: jax.Array) -> jax.Array:
+        """Evaluate the taken actions [B] (flat indices) only: ``self(window)`` flattened and gathered, [B]."""
+        q = self._q_of_window(window)
+        row, col, aperture = grid.decode_action(action)
+        row, col = row - window.origin[:, 0], col - window.origin[:, 1]
+        rows, cols = q.shape[1:3]
+        inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+        taken = q[jnp.arange(len(action)), jnp.clip(row, 0, rows - 1), jnp.clip(col, 0, cols - 1), aperture]
+        return jnp.where(inside, taken, 0.0)
+
+    def _q_of_window(self, window: Window) -> jax.Array:
+        """Return [B, R, C, 2]."""
+        x = window.images
+        assert x.ndim == 4 and x.shape[-1] == 3, f"expected [B, R, C, 3], got {x.shape}"
+        assert x.shape[1] % PATCH == 0 and x.shape[2] % PATCH == 0, f"R and C must be divisible by {PATCH}: {x.shape}"
+        float32, he = jnp.dtype(jnp.float32), nn.initializers.he_normal()
+        x = nn.relu(Conv(self.channels, 3, he, float32, name="stem")(patches(_label_channels(x))))
+        for i in range(self.blocks):
+            hidden = nn.relu(Conv(self.channels, 3, he, float32, name=f"block{i}_in")(x))
+            # Zero at first: a network of identities learns from the first update on.
+            x = nn.relu(x + Conv(self.channels, 3, nn.initializers.zeros, float32, name=f"block{i}_out")(hidden))
+        small = nn.initializers.variance_scaling(1e-4, "fan_in", "normal")
+        q = Conv(2, 1, small, float32, nn.initializers.constant(self.initial_bias), name="readout")(x)
+        for _ in range(int(math.log2(PATCH))):
+            q = upsample(q)
+        return q
+
+
+def patches(x: jax.Array) -> jax.Array:
+    """Turn the pixels of every patch into channels: [B, R, C, K] to [B, R / 4, C / 4, 16 K]."""
+    batch, rows, cols, channels = x.shape
+    x = x.reshape(batch, rows // PATCH, PATCH, cols // PATCH, PATCH, channels)
+    return x.transpose(0, 1, 3, 2, 4, 5).reshape(batch, rows // PATCH, cols // PATCH, PATCH**2 * channels)
+
+
+def _label_channels(images: jax.Array) -> jax.Array:
+    """Give every label but the table a channel of its own: [..., 3] to [..., 5]."""
+    height, segmentation, inside = jnp.split(images, 3, axis=-1)
+    label = jnp.round(segmentation * max(SEGMENTATION.values()))
+    labels = [(label == value).astype(images.dtype) for name, value in SEGMENTATION.items() if name != "table"]
+    return jnp.concatenate([height, *labels, inside], axis=-1)
