@@ -31,7 +31,7 @@ from pregrasp_jax.assets.meshes import load_mesh, load_object_dir, mesh_folder
 from pregrasp_jax.assets.settings import load_settings
 from pregrasp_jax.robot import description, kinematics
 from pregrasp_jax.robot.model import home_joint_pos, joint_qpos_ids
-from pregrasp_jax.types import MAX_OBJECTS, Observation, PhysicsObservation, SceneParams
+from pregrasp_jax.types import MAX_OBJECTS, ROBOT_ID, HullBank, Observation, PhysicsObservation, SceneParams
 
 SPACING = 0.1
 """m between the objects, which stand on a 3 x 3 pattern with one place free."""
@@ -195,9 +195,11 @@ def measure(args: argparse.Namespace) -> dict[str, float]:
     hulls = jax.jit(jax.vmap(heightmap.scene_hulls, (None, 0, 0)))(bank, scene, physics_obs)
 
     def timed(view: str | heightmap.Camera) -> float:
-        run = jax.jit(
-            jax.vmap(lambda s, p: heightmap.observe(heightmap.scene_hulls(bank, s, p), p.hand_pose[:2], camera=view))
-        )
+        def look(scene: SceneParams, physics_obs: PhysicsObservation) -> Observation:
+            hulls = heightmap.scene_hulls(bank, scene, physics_obs)
+            return heightmap.observe(hulls, physics_obs.hand_pose[:2], camera=view)
+
+        run = jax.jit(jax.vmap(look))
         return best_ms(lambda: run(scene, physics_obs), args.repetitions) / args.scenes
 
     result = {"orthographic_ms_per_scene": timed("orthographic"), "pinhole_ms_per_scene": timed(camera)}

@@ -234,7 +234,9 @@ _RANGES: dict[str, tuple[float, float]] = {
 }
 
 _CPU = Config(
-    network=NetworkConfig(width=0.25),
+    scene=SceneConfig(validation_scenes=100),
+    network=NetworkConfig(architecture="compact", width=0.25, initial_bias=0.5),
+    learner=LearnerConfig(learning_rate=1e-3, polyak=0.995, huber_delta=1.0, updates_per_step=0.5),
     train=TrainConfig(num_envs=16, episodes=25_000, minutes=150.0),
 )
 
