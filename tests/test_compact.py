@@ -1,0 +1,147 @@
+"""The compact network: its window, and that values and gradients land where the grid says."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pregrasp_jax import grid, heightmap, primitives
+from pregrasp_jax.config import PRESETS, NetworkConfig, TaskConfig
+from pregrasp_jax.learning.compact import (
+    PATCH,
+    CompactNetwork,
+    Window,
+    look_around_hand,
+    paste,
+    patches,
+    window_size,
+)
+from pregrasp_jax.learning.networks import num_parameters
+from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.robot import model as robot
+from pregrasp_jax.types import Observation
+
+START = tuple(robot.START_POSE[:2])
+SIZE = window_size(TaskConfig())
+
+
+def observation(p1) -> Observation:
+    """Heights that differ from cell to cell, objects 1 to 3 and the robot in four quarters."""
+    rows, cols = np.indices((100, 100))
+    ids = np.where(rows < 50, 1, 2) + np.where(cols < 50, 0, 1)
+    ids[80:, 80:] = 9
+    return Observation(
+        jnp.asarray((7 * rows + 13 * cols) % 256, jnp.uint8), jnp.asarray(ids, jnp.uint8), jnp.asarray(p1, jnp.float32)
+    )
+
+
+@pytest.mark.parametrize("p1", [START, (-0.1025, 0.0525), (0.2475, 0.2475), (-0.2475, -0.2475), (0.0025, -0.1)])
+def test_window_is_the_picture_around_the_hand_and_zero_outside(p1):
+    obs = observation(p1)
+    window = jax.jit(functools.partial(look_around_hand, size=SIZE))(obs, jnp.int32(1))
+    whole = np.asarray(heightmap.network_input(obs, jnp.int32(1)))
+    # The cell that holds p1, or the one above where p1 lies on an edge between two.
+    row, col = (round((p1[i] + 0.25) / 0.005 - 0.5 + 1e-3) for i in (1, 0))
+    np.testing.assert_array_equal(window.origin, [row - SIZE.beside, col - SIZE.behind])
+    expected = np.zeros((*SIZE.shape, 3))
+    for r in range(SIZE.shape[0]):
+        for c in range(SIZE.shape[1]):
+            y, x = r + row - SIZE.beside, c + col - SIZE.behind
+            if 0 <= y < 100 and 0 <= x < 100:
+                expected[r, c] = [*whole[y, x], 1.0]
+    np.testing.assert_allclose(window.images, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("full_ring", [False, True])
+@pytest.mark.parametrize("r_out", [0.1, 0.15, 0.2, 0.33])
+def test_window_holds_every_cell_of_the_ring(r_out, full_ring):
+    task = TaskConfig(r_out=r_out, full_ring=full_ring)
+    size = window_size(task)
+    assert size.shape[0] % PATCH == 0 and size.shape[1] % PATCH == 0
+    for p1 in (START, (0.0025, 0.0025), (0.1975, -0.2475)):
+        mask = primitives.half_ring_mask(jnp.array(p1), r_in=task.r_in, r_out=r_out, full_ring=full_ring)
+        origin = look_around_hand(observation(p1), jnp.int32(0), size=size).origin
+        inside = paste(jnp.ones((*size.shape, 2)), origin)[..., 0]
+        assert bool(jnp.all(inside[mask] == 1.0)) and bool(mask.any())
+
+
+def test_paste_puts_cells_where_they_come_from():
+    q = jnp.arange(8.0 * 12 * 2).reshape(8, 12, 2)
+    pasted = np.asarray(paste(q, jnp.array([-3, 95])))
+    np.testing.assert_array_equal(pasted[:5, 95:], q[3:, :5])
+    assert (pasted[5:] == 0).all() and (pasted[:, :95] == 0).all()
+
+
+def test_patches_hold_their_own_pixels():
+    x = jnp.arange(2 * 8 * 12 * 3.0).reshape(2, 8, 12, 3)
+    np.testing.assert_array_equal(patches(x)[1, 1, 2].reshape(4, 4, 3), x[1, 4:8, 8:12])
+
+
+def make_network():
+    network = CompactNetwork(channels=4, blocks=2, initial_bias=0.3)
+    images = jax.random.uniform(jax.random.key(1), (3, *SIZE.shape, 3))
+    window = Window(images, jnp.array([[-10, -20], [20, 60], [3, 4]]))
+    params = jax.tree.map(
+        lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(2), leaf.shape),
+        network.init(jax.random.key(0), window),
+    )
+    return network, params, window
+
+
+def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window():
+    network, params, window = make_network()
+    whole = np.asarray(jax.jit(network.apply)(params, window))
+    assert whole.shape == (3, 100, 100, 2) and np.ptp(whole) > 0.1
+    actions = [
+        grid.encode_action(jnp.int32(r), jnp.int32(c), jnp.int32(a))
+        for r, c, a in ((9, 30, 1), (99, 99, 0), (80, 3, 1))
+    ]
+    taken = jax.jit(functools.partial(network.apply, method="q_of_action"))(params, window, jnp.stack(actions))
+    np.testing.assert_allclose(taken[:2], [whole[0, 9, 30, 1], whole[1, 99, 99, 0]], rtol=1e-5)
+    assert taken[2] == whole[2, 80, 3, 1] == 0.0  # left of its window
+    assert whole[2, 80, 4, 1] != 0.0
+
+
+def test_values_move_with_the_hand_and_the_scene():
+    """The same surroundings two patches further give the same values two patches further."""
+    network, params, _ = make_network()
+    q = jax.jit(
+        lambda obs: network.apply(
+            params, jax.tree.map(lambda x: x[None], look_around_hand(obs, jnp.int32(0), size=SIZE))
+        )[0]
+    )
+    ids = np.zeros((100, 100), np.uint8)
+    ids[40:52, 45:60], ids[30:36, 45:50] = 1, 2
+    here = q(Observation(jnp.asarray(30 * ids), jnp.asarray(ids), jnp.array([-0.0525, -0.0025])))
+    ids = np.roll(ids, (5, -7), axis=(0, 1))
+    there = q(Observation(jnp.asarray(30 * ids), jnp.asarray(ids), jnp.array([-0.0875, 0.0225])))
+    np.testing.assert_allclose(here[40:60, 45:60], np.asarray(there)[45:65, 38:53], atol=1e-5)
+
+
+def test_untrained_it_promises_its_bias_everywhere_and_learns_in_every_layer():
+    config = PRESETS["cpu"]
+    q = make_q_function(config.network, config.task)
+    params = q.init(jax.random.key(0))
+    assert num_parameters(params) == 78_626  # also the size that config.py and README name
+    values = q.values(params, observation(START), jnp.int32(0))
+    mask = primitives.half_ring_mask(jnp.asarray(START), r_in=config.task.r_in, r_out=config.task.r_out)
+    np.testing.assert_allclose(values[mask], 0.5, atol=0.05)
+    inputs = jax.tree.map(lambda x: x[None], q.input_fn(observation((-0.1025, 0.0025)), jnp.int32(0)))
+    gradient = jax.grad(lambda p: q.of_action(p, inputs, jnp.array([2 * (50 * 100 + 50)]))[0])(params)
+    flat = {"/".join(str(k.key) for k in path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(gradient)}
+    silent = {name for name, leaf in flat.items() if not np.any(leaf)}
+    assert all(name.startswith("block") and "_in/" in name for name in silent), silent
+
+
+def test_paper_and_compact_answer_alike():
+    obs = observation((-0.1, 0.0))
+    for architecture in ("paper", "compact"):
+        q = make_q_function(NetworkConfig(architecture=architecture, width=1 / 32, initial_bias=0.2), TaskConfig())
+        params = q.init(jax.random.key(0))
+        values = q.values(params, obs, jnp.int32(0))
+        inputs = jax.tree.map(lambda x: x[None], q.input_fn(obs, jnp.int32(0)))
+        action = jnp.array([grid.encode_action(jnp.int32(52), jnp.int32(40), jnp.int32(1))])
+        np.testing.assert_allclose(q.of_action(params, inputs, action)[0], values[52, 40, 1], rtol=1e-4)
+        assert values.shape == (100, 100, 2) and values.dtype == jnp.float32
