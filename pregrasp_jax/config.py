@@ -138,6 +138,10 @@ class ExplorationConfig:
     """rad, spread of guided actions around the direction to the target."""
     open_probability: float = 0.7
     """Share of guided actions with an open hand."""
+    branches: int = 0
+    """More pushes simulated from every state, only to learn from: drawn like the real one, but softmax for greedy."""
+    branch_temperature: float = 0.1
+    """Temperature of that softmax, in units of Q."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,6 +229,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "exploration.epsilon_decay": (1, 1_000_000_000),
     "exploration.angle_std": (0.0, 10.0),
     "exploration.open_probability": (0.0, 1.0),
+    "exploration.branches": (0, 64),
+    "exploration.branch_temperature": (1e-3, 100.0),
     "train.num_envs": (1, 65_536),
     "train.episodes": (1, 1_000_000_000),
     "train.minutes": (0.0, 1e6),

@@ -58,6 +58,22 @@ def guided_action(
     return (2 * cell + aperture).astype(jnp.int32)
 
 
+def softmax_action(key: jax.Array, q: jax.Array, mask: jax.Array, *, temperature: float) -> jax.Array:
+    """Draw a push in proportion to exp(Q / temperature) inside the half ring.
+
+    Args:
+        key: consumed.
+        q: [H, W, 2].
+        mask: [H, W] bool, at least one cell.
+        temperature: in units of Q.
+
+    Returns:
+        () int32 action.
+    """
+    logits = jnp.where(mask[..., None], q / temperature, -jnp.inf)
+    return jax.random.categorical(key, logits.ravel()).astype(jnp.int32)
+
+
 def random_action(key: jax.Array) -> jax.Array:
     """Draw uniformly from all `grid.NUM_ACTIONS`, inside the half ring or not: the Random-Exp ablation.
 

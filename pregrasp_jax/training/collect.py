@@ -4,6 +4,7 @@
 physics of the next push may run while the learner still digests the last one.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -89,8 +90,8 @@ class Experience(struct.PyTreeNode):
     """What one push of every scene hands to the learner.
 
     Attributes:
-        steps: one transition per scene.
-        eligible: [E, MAX_OBJECTS] bool, slots whose object may be a hindsight goal.
+        steps: one transition per scene, then those of the branches, each an episode of its own, cut short.
+        eligible: [E (1 + branches), MAX_OBJECTS] bool, slots whose object may be a hindsight goal.
         episodes: () int32 ended ever, this push included.
     """
 
@@ -144,32 +145,38 @@ def make_collect(
             open_probability=config.open_probability,
         )
 
-    def greedy(params: Params, states: EnvState, masks: jax.Array) -> jax.Array:
-        inputs = jax.vmap(input_fn)(states.obs, states.scene.target)
-        return jax.vmap(greedy_action)(apply_fn(params, inputs), masks)
-
-    def act(key: jax.Array, params: Params, states: EnvState, epsilon: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return actions [E] and which of them are random [E]."""
-        num_envs = states.p1.shape[0]
-        masks = jax.vmap(env.action_mask)(states.p1)
-        explore_key, choice_key = jax.random.split(key)
-        exploratory = jax.vmap(explore)(jax.random.split(explore_key, num_envs), states, masks)
-        random = jax.random.uniform(choice_key, (num_envs,)) < epsilon
-        return jnp.where(random, exploratory, greedy(params, states, masks)), random
+    def act(key: jax.Array, state: EnvState, q: jax.Array, epsilon: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return actions [1 + branches] of one scene, the real one first, and which of them are random."""
+        mask = env.action_mask(state.p1)
+        explore_key, choice_key, softmax_key = jax.random.split(key, 3)
+        explore_keys = jax.random.split(explore_key, 1 + config.branches)
+        exploratory = jax.vmap(explore, (0, None, None))(explore_keys, state, mask)
+        random = jax.random.uniform(choice_key, exploratory.shape) < epsilon
+        draw = functools.partial(exploration.softmax_action, temperature=config.branch_temperature)
+        drawn = jax.vmap(draw, (0, None, None))(jax.random.split(softmax_key, config.branches), q, mask)
+        promising = jnp.concatenate([greedy_action(q, mask)[None], drawn])
+        return jnp.where(random, exploratory, promising), random
 
     def collect(actors: Actors, params: Params) -> tuple[Actors, Experience]:
         states = actors.env_states
+        num_envs = states.p1.shape[0]
         key, action_key, reset_key = jax.random.split(actors.key, 3)
         epsilon = epsilon_at(actors.tally.env_steps, config, warmup=warmup)
-        actions, random = act(action_key, params, states, epsilon)
-        next_states, results = jax.vmap(env.step)(states, actions)
+        q = apply_fn(params, jax.vmap(input_fn)(states.obs, states.scene.target))
+        keys = jax.random.split(action_key, num_envs)
+        actions, random = jax.vmap(act, (0, 0, 0, None))(keys, states, q, epsilon)
+        # Scenes first, then the branches: [E (1 + branches)].
+        starts = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * (1 + config.branches)), states)
+        actions = actions.T.ravel()
+        ends, results = jax.vmap(env.step)(starts, actions)
+        of_branch = jnp.arange(len(actions)) >= num_envs
+        results = results.replace(truncated=results.truncated | (of_branch & ~results.terminated))
+        experience = Experience(_steps(starts, actions, results, ends), _eligible(env.bank, starts), jnp.int32(0))
+        next_states, results = jax.tree.map(lambda leaf: leaf[:num_envs], (ends, results))
         ended = results.terminated | results.truncated
-        tally = _count(actors.tally, results, ended, random)
-        fresh = jax.vmap(env.reset)(jax.random.split(reset_key, ended.shape[0]))
-        experience = Experience(
-            _steps(states, actions, results, next_states), _eligible(env.bank, states), tally.episodes
-        )
-        return Actors(_select(ended, fresh, next_states), key, tally), experience
+        tally = _count(actors.tally, results, ended, random[:, 0])
+        fresh = jax.vmap(env.reset)(jax.random.split(reset_key, num_envs))
+        return Actors(_select(ended, fresh, next_states), key, tally), experience.replace(episodes=tally.episodes)
 
     return collect
 
