@@ -112,3 +112,17 @@ def test_the_warm_up_only_explores():
     config = ExplorationConfig(epsilon_start=0.5, epsilon_end=0.1, epsilon_decay=100)
     values = [float(epsilon_at(step, config, warmup=50)) for step in (0, 49, 50, 100)]
     assert values == pytest.approx([1.0, 1.0, 0.3, 0.1])
+
+
+def test_softmax_action_follows_its_distribution_inside_the_mask():
+    mask = np.zeros((100, 100), bool)
+    mask[3, 4] = mask[50, 60] = True
+    q = jnp.full((100, 100, 2), 9.0).at[3, 4].set(jnp.array([0.1, 0.3])).at[50, 60].set(jnp.array([0.0, 0.2]))
+    draw = jax.vmap(lambda key: exploration.softmax_action(key, q, jnp.asarray(mask), temperature=0.1))
+    actions = np.asarray(draw(jax.random.split(jax.random.key(0), 4000)))
+    assert actions.dtype == np.int32
+    weights = np.exp(np.array([1.0, 3.0, 0.0, 2.0]))
+    cells = [2 * (3 * 100 + 4), 2 * (3 * 100 + 4) + 1, 2 * (50 * 100 + 60), 2 * (50 * 100 + 60) + 1]
+    shares = [(actions == cell).mean() for cell in cells]
+    assert sum(shares) == pytest.approx(1.0)
+    np.testing.assert_allclose(shares, weights / weights.sum(), atol=0.03)

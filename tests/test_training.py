@@ -141,6 +141,38 @@ def test_metrics_add_up(finished):
     assert last["train/epsilon"] == pytest.approx(1.0 - 0.9 * min(1.0, last["env_steps"] / 64))
 
 
+def test_branches_are_learned_from_and_change_nothing_else():
+    """Three pushes from every state: the scenes go on from the first, the others are episodes cut short."""
+    values = to_dict(make_config())
+    values["exploration"] |= {"branches": 2, "epsilon_start": 0.5}
+    values["replay"] |= {"capacity": 300}
+    built = make_program(from_dict(values))
+    state = jax.jit(built.init)(jax.random.key(0))
+    collect_once, remember = jax.jit(built.collect), jax.jit(built.remember)
+    params, branch_actions = state.learning.learner.params, []
+    for step in range(1, 9):
+        before = state.actors
+        actors, experience = collect_once(before, params)
+        learning = remember(state.learning, experience)
+        state = state.replace(actors=actors, learning=learning)
+        steps = experience.steps
+        assert steps.action.shape == (9,) and int(actors.tally.env_steps) == 3 * step
+        for branch in range(3):
+            of_branch = slice(3 * branch, 3 * branch + 3)
+            np.testing.assert_array_equal(steps.obs.height[of_branch], before.env_states.obs.height)
+            np.testing.assert_array_equal(steps.goal[of_branch], before.env_states.scene.target)
+        ended = np.asarray(steps.terminated | steps.truncated)
+        assert ended[3:].all() and not np.any(steps.terminated & steps.truncated)
+        going_on = ~ended[:3]
+        np.testing.assert_array_equal(
+            np.asarray(actors.env_states.obs.height)[going_on], np.asarray(steps.next_obs.height)[:3][going_on]
+        )
+        branch_actions.append(np.asarray(steps.action).reshape(3, 3))
+        assert int(learning.replay.rows_written) == 9 * step + int(learning.replay.hindsight_rows_written)
+    different = [len(set(actions)) for actions in np.concatenate(branch_actions, axis=1).T]
+    assert np.mean(different) > 2.5, "branches of one state are drawn independently"
+
+
 def test_a_finished_run_leaves_everything(finished):
     path = finished.folder.path
     assert finished.saved and finished.progress.episodes >= 24
