@@ -124,6 +124,7 @@ def test_jitted_memory_agrees_with_a_plain_loop_over_the_shipped_judge():
             truncated = not terminated and len(episodes[env]) == MAX_PUSHES
             pushes.append(
                 replay.Steps(
+                    root=jnp.int32(env),
                     obs=image(0),
                     action=jnp.int32(number),
                     goal=jnp.int32(goals[env]),
@@ -165,7 +166,9 @@ def test_without_the_call_there_are_no_hindsight_rows():
     rng = np.random.default_rng(0)
     outcome = random_outcome(rng, enclosed=3)
     reward, terminated, _ = compiled_judge(outcome, jnp.int32(0))
-    step = functools.partial(replay.Steps, obs=image(0), next_obs=image(1), truncated=jnp.asarray(False))
+    step = functools.partial(
+        replay.Steps, root=jnp.int32(0), obs=image(0), next_obs=image(1), truncated=jnp.asarray(False)
+    )
     steps = stack([step(action=jnp.int32(0), goal=jnp.int32(0), outcome=outcome, reward=reward, terminated=terminated)])
     memory = jax.jit(replay.add)(replay.init(steps, capacity=20, max_pushes=MAX_PUSHES), steps)
     assert int(memory.hindsight_rows_written) == 0 and int(memory.num_alive) == 1

@@ -59,6 +59,7 @@ def push(state, action, next_state, *, goal=0, enclosed=None, approach=(), trunc
     )
     reward, terminated, _ = judge(outcome, jnp.int32(goal))
     step = replay.Steps(
+        root=jnp.int32(0),
         obs=image(state),
         action=jnp.int32(action),
         goal=jnp.int32(goal),

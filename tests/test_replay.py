@@ -62,6 +62,7 @@ class World:
             diverged=stack("diverged", bool),
         )
         return replay.Steps(
+            root=jnp.arange(NUM_ENVS),
             obs=image([row["obs"] for row in rows]),
             action=stack("action", np.int32),
             goal=stack("goal", np.int32),

@@ -168,7 +168,13 @@ def test_branches_are_learned_from_and_change_nothing_else():
             np.asarray(actors.env_states.obs.height)[going_on], np.asarray(steps.next_obs.height)[:3][going_on]
         )
         branch_actions.append(np.asarray(steps.action).reshape(3, 3))
-        assert int(learning.replay.rows_written) == 9 * step + int(learning.replay.hindsight_rows_written)
+        memory = learning.replay
+        assert int(memory.rows_written) == 9 * step + int(memory.hindsight_rows_written)
+        # The state before a push is stored once, for its three pushes and the one before.
+        assert int(memory.observations_written) == 9 * step + 3 + int(actors.tally.episodes) - int(ended[:3].sum())
+        slots = np.asarray(memory.episodes.rows)[:, 0]
+        stored = np.asarray(memory.observations.height)[np.asarray(memory.rows.obs_slot)[slots[3:]]]
+        np.testing.assert_array_equal(stored, steps.obs.height[3:])
     different = [len(set(actions)) for actions in np.concatenate(branch_actions, axis=1).T]
     assert np.mean(different) > 2.5, "branches of one state are drawn independently"
 

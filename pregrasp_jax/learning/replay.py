@@ -30,7 +30,10 @@ InputFn = Callable[[Observation, jax.Array], jax.Array]
 class Steps(struct.PyTreeNode):
     """One push in each of E scenes; every leaf has the leading axis E.
 
+    A branch, another push from the state of a scene, counts as a scene whose episodes are one push long.
+
     Attributes:
+        root: [E] int32, which of the scenes holds the same `obs`: itself, or the scene that it branches from.
         obs: before the push.
         action: [E] int32.
         goal: [E] int32 slot of the target.
@@ -41,6 +44,7 @@ class Steps(struct.PyTreeNode):
         next_obs: after the push, before any reset; the next step's `obs` unless the episode ends.
     """
 
+    root: jax.Array
     obs: Observation
     action: jax.Array
     goal: jax.Array
@@ -205,8 +209,9 @@ def add(replay: Replay, steps: Steps) -> Replay:
     num_envs = steps.action.shape[0]
     fresh = replay.episodes.ended
     images = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), steps.obs, steps.next_obs)
-    replay, slots = _write_observations(replay, images, jnp.concatenate([fresh, jnp.ones(num_envs, bool)]))
-    obs_slot = jnp.where(fresh, slots[:num_envs], replay.episodes.obs_slot)
+    unseen = fresh & (steps.root == jnp.arange(num_envs))
+    replay, slots = _write_observations(replay, images, jnp.concatenate([unseen, jnp.ones(num_envs, bool)]))
+    obs_slot = jnp.where(fresh, slots[:num_envs], replay.episodes.obs_slot)[steps.root]
     rows = Rows(
         obs_slot=obs_slot,
         next_obs_slot=slots[num_envs:],

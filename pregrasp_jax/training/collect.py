@@ -171,7 +171,9 @@ def make_collect(
         ends, results = jax.vmap(env.step)(starts, actions)
         of_branch = jnp.arange(len(actions)) >= num_envs
         results = results.replace(truncated=results.truncated | (of_branch & ~results.terminated))
-        experience = Experience(_steps(starts, actions, results, ends), _eligible(env.bank, starts), jnp.int32(0))
+        root = jnp.arange(len(actions), dtype=jnp.int32) % num_envs
+        steps = _steps(root, starts, actions, results, ends)
+        experience = Experience(steps, _eligible(env.bank, starts), jnp.int32(0))
         next_states, results = jax.tree.map(lambda leaf: leaf[:num_envs], (ends, results))
         ended = results.terminated | results.truncated
         tally = _count(actors.tally, results, ended, random[:, 0])
@@ -189,8 +191,9 @@ def epsilon_at(env_steps: jax.Array | int, config: ExplorationConfig, *, warmup:
     return jnp.where(env_steps < warmup, 1.0, decayed)
 
 
-def _steps(states: EnvState, actions: jax.Array, results: StepResult, next_states: EnvState) -> Steps:
+def _steps(root: jax.Array, states: EnvState, actions: jax.Array, results: StepResult, next_states: EnvState) -> Steps:
     return Steps(
+        root=root,
         obs=states.obs,
         action=actions,
         goal=states.scene.target,

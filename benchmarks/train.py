@@ -1,0 +1,145 @@
+"""Where the time of a training goes, stage by stage; prints one JSON object.
+
+    python benchmarks/train.py [--preset cpu] [--scenes-packed 64]
+
+Stages are compiled alone and timed on states and a memory met on the way. `ms_per_env_step` spreads each over the
+pushes it serves: a checkpoint over the steps between two of them, an update over `1 / updates_per_step`.
+"""
+
+import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
+
+# isort: split
+import argparse
+import dataclasses
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pregrasp_jax.checkpoint.state import save
+from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.env import make_env
+from pregrasp_jax.learning import learner, replay
+from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.training.program import Program, TrainState, make_program
+
+STEPS = 40
+"""Parallel steps that fill the memory before anything is timed."""
+
+
+def best_ms(function: Callable[[], object], *, repetitions: int = 10) -> float:
+    """Return the shortest of several calls, in ms; the first one compiles and does not count."""
+    jax.block_until_ready(function())
+    times = []
+    for _ in range(repetitions):
+        start = time.perf_counter()
+        jax.block_until_ready(function())
+        times.append(time.perf_counter() - start)
+    return 1e3 * min(times)
+
+
+def fill(program: Program, state: TrainState) -> tuple[TrainState, Any]:
+    """Collect `STEPS` times; return the state and the last experience."""
+    collect, remember = jax.jit(program.collect), jax.jit(program.remember)
+    experience = None
+    for _ in range(STEPS):
+        actors, experience = collect(state.actors, state.learning.learner.params)
+        state = TrainState(actors, remember(state.learning, experience))
+    return state, experience
+
+
+def measure(config: Config) -> dict[str, Any]:
+    """Return ms per env step of every stage, and the rates that follow."""
+    env = make_env(config, split="train")
+    program = make_program(env, config)
+    state, experience = fill(program, jax.jit(program.init)(jax.random.key(0)))
+    q = make_q_function(config.network, config.task)
+    learning, states, key = state.learning, state.actors.env_states, jax.random.key(1)
+    params, memory = learning.learner.params, learning.replay
+    num_envs = config.train.num_envs
+
+    def act(params: Any, states: Any) -> jax.Array:
+        return q.apply(params, jax.vmap(q.input_fn)(states.obs, states.scene.target))
+
+    def sample(memory: replay.Replay, key: jax.Array) -> replay.Batch:
+        return replay.sample(
+            memory, key, batch_size=config.learner.batch_size, importance_exponent=0.4, input_fn=q.input_fn
+        )
+
+    def target(params: Any, batch: replay.Batch) -> jax.Array:
+        return jax.vmap(learner.max_q)(q.apply(params, batch.next_inputs), jax.vmap(env.action_mask)(batch.next_p1))
+
+    reset, collect, remember, update = (
+        jax.jit(f) for f in (jax.vmap(env.reset), program.collect, program.remember, program.update)
+    )
+    act, sample, target = jax.jit(act), jax.jit(sample), jax.jit(target)
+    batch = sample(memory, key)
+    keys = jax.random.split(key, num_envs)
+    ms = {
+        "collect": best_ms(lambda: collect(state.actors, params)),
+        "act": best_ms(lambda: act(params, states)),
+        "reset": best_ms(lambda: reset(keys)),
+        "remember": best_ms(lambda: remember(learning, experience)),
+        "sample": best_ms(lambda: sample(memory, key)),
+        "target": best_ms(lambda: target(params, batch)),
+        "update": best_ms(lambda: update(learning, jnp.float32(0.4))),
+    }
+    start = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        save(Path(folder), 1, state.split()[0], state.ring(), {})
+    ms["checkpoint"] = 1e3 * (time.perf_counter() - start)
+    return summary(ms, config)
+
+
+def summary(ms: dict[str, float], config: Config) -> dict[str, Any]:
+    """Turn times of whole calls into times per env step."""
+    num_envs, updates = config.train.num_envs, config.learner.updates_per_step
+    per_step = {
+        "push": (ms["collect"] - ms["act"] - ms["reset"]) / num_envs,
+        "act": ms["act"] / num_envs,
+        "reset": ms["reset"] / num_envs,
+        "remember": ms["remember"] / num_envs,
+        "sample": updates * ms["sample"],
+        "target": updates * ms["target"],
+        "gradient": updates * (ms["update"] - ms["sample"] - ms["target"]),
+    }
+    total = sum(per_step.values())
+    # A checkpoint writes what is new: here all of the memory, in training the pushes of `checkpoint_minutes`.
+    per_step["checkpoint"] = ms["checkpoint"] / (60e3 * config.train.checkpoint_minutes / total)
+    total += per_step["checkpoint"]
+    return {
+        "ms_per_env_step": {name: round(value, 3) for name, value in per_step.items()},
+        "env_steps_per_second": 1e3 / total,
+        "gradient_steps_per_second": updates * 1e3 / total,
+        "update_ms_per_sample": ms["update"] / config.learner.batch_size,
+        "checkpoint_ms": ms["checkpoint"],
+        "branches": config.exploration.branches,
+        "cores": len(os.sched_getaffinity(0)),
+    }
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", choices=sorted(PRESETS), default="cpu", help="configuration that is profiled")
+    parser.add_argument("--scenes-packed", type=int, default=64, help="training scenes to pack, few to be quick")
+    parser.add_argument("--capacity", type=int, help="observations in the memory instead of the preset's")
+    arguments = parser.parse_args()
+    config = PRESETS[arguments.preset]
+    capacity = arguments.capacity or config.replay.capacity
+    config = dataclasses.replace(
+        config,
+        scene=dataclasses.replace(config.scene, train_scenes=arguments.scenes_packed),
+        replay=dataclasses.replace(config.replay, capacity=capacity),
+    )
+    print(json.dumps(measure(config), indent=2))
+
+
+if __name__ == "__main__":
+    main()
