@@ -108,6 +108,10 @@ class LearnerConfig:
 
     learning_rate: float = 1e-4
     """Adam step size."""
+    final_learning_rate: float = 1e-4
+    """Adam step size at the end of a linear decay."""
+    learning_rate_steps: int = 0
+    """Updates over which the step size decays; 0 keeps it."""
     discount: float = 0.5
     """Gamma."""
     polyak: float = 0.999
@@ -218,6 +222,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "replay.importance_exponent": (0.0, 1.0),
     "replay.importance_steps": (1, 1_000_000_000),
     "learner.learning_rate": (1e-7, 1.0),
+    "learner.final_learning_rate": (0.0, 1.0),
+    "learner.learning_rate_steps": (0, 1_000_000_000),
     "learner.discount": (0.0, 0.999),
     "learner.polyak": (0.0, 1.0),
     "learner.huber_delta": (1e-4, 100.0),
@@ -242,8 +248,12 @@ _RANGES: dict[str, tuple[float, float]] = {
 _CPU = Config(
     scene=SceneConfig(validation_scenes=100),
     network=NetworkConfig(architecture="compact", width=0.25, initial_bias=0.5),
-    learner=LearnerConfig(learning_rate=1e-3, polyak=0.995, huber_delta=1.0, updates_per_step=0.5),
-    train=TrainConfig(num_envs=16, episodes=25_000, minutes=150.0),
+    replay=ReplayConfig(capacity=100_000, importance_steps=50_000),
+    learner=LearnerConfig(
+        learning_rate=1e-3, learning_rate_steps=100_000, polyak=0.995, huber_delta=1.0, updates_per_step=2.0
+    ),
+    exploration=ExplorationConfig(epsilon_decay=10_000, branches=3),
+    train=TrainConfig(num_envs=16, episodes=25_000, minutes=150.0, evaluate_every=2_500),
 )
 
 PRESETS: dict[str, Config] = {
@@ -259,7 +269,7 @@ PRESETS: dict[str, Config] = {
         _CPU,
         scene=SceneConfig(train_scenes=64, validation_scenes=10, test_scenes=50),
         replay=ReplayConfig(capacity=5_000, importance_steps=5_000),
-        exploration=ExplorationConfig(epsilon_decay=3_000),
+        exploration=ExplorationConfig(epsilon_decay=2_000, branches=3),
         train=TrainConfig(num_envs=16, episodes=2_000, minutes=5.0, evaluate_every=0),
     ),
     "cpu": _CPU,

@@ -1,6 +1,6 @@
 """A Q-network for CPUs: it sees only what surrounds the hand, and computes on 2 cm patches.
 
-The half ring reaches 0.2 m, so a window around the hand holds all that a push can touch, on half of the cells. Inside
+The half ring reaches 0.2 m, so a window around the hand holds all that a push can touch, on two thirds of the cells. Inside
 it a patch of 4x4 cells is one position with all of its 16 pixels as channels, and three residual blocks look
 0.14 m in every direction. At 32 channels an update costs an eighth of the paper's network at width 0.25.
 
@@ -23,8 +23,9 @@ from pregrasp_jax.types import Observation
 PATCH = 4
 """Cells per side of what the network takes for one position."""
 
-_BEHIND, _BESIDE, _BEYOND = 16, 4, 8
-"""Cells of the window behind the hand, and beyond the reach of a push at its sides and ahead of it."""
+_BEHIND, _BESIDE, _BEYOND = 16, 4, 24
+"""Cells of the window behind the hand, and beyond the reach of a push at its sides and ahead of it, where a row of
+objects may be pushed off the table."""
 
 
 class WindowSize(struct.PyTreeNode):

@@ -141,8 +141,12 @@ def make_update(
 
 
 def make_optimizer(config: LearnerConfig) -> optax.GradientTransformation:
-    """Return Adam."""
-    return optax.adam(config.learning_rate)
+    """Return Adam, its step size constant or decaying linearly."""
+    if not config.learning_rate_steps:
+        return optax.adam(config.learning_rate)
+    return optax.adam(
+        optax.linear_schedule(config.learning_rate, config.final_learning_rate, config.learning_rate_steps)
+    )
 
 
 METRICS = (
