@@ -81,7 +81,7 @@ class NetworkConfig:
     architecture: Architecture = "paper"
     """`paper`: Fig. 3 on the whole grid; `compact`: 2 cm patches of a window around the hand, for CPUs."""
     width: float = 1.0
-    """Factor on all channel counts; 1.0 is the paper's 7.4 M parameters, 0.25 has 0.46 M (compact: 0.08 M)."""
+    """Factor on all channel counts; 1.0 is the paper's 7.4 M parameters, 0.25 has 0.46 M (compact: 0.12 M)."""
     initial_bias: float = 0.0
     """Q-value of every push before training."""
 

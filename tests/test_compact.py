@@ -124,7 +124,7 @@ def test_untrained_it_promises_its_bias_everywhere_and_learns_in_every_layer():
     config = PRESETS["cpu"]
     q = make_q_function(config.network, config.task)
     params = q.init(jax.random.key(0))
-    assert num_parameters(params) == 78_626  # also the size that config.py and README name
+    assert num_parameters(params) == 115_618  # also the size that config.py and README name
     values = q.values(params, observation(START), jnp.int32(0))
     mask = primitives.half_ring_mask(jnp.asarray(START), r_in=config.task.r_in, r_out=config.task.r_out)
     np.testing.assert_allclose(values[mask], 0.5, atol=0.05)

@@ -184,7 +184,7 @@ def test_a_finished_run_leaves_everything(finished):
     assert finished.saved and finished.progress.episodes >= 24
     assert stored_config(path) == finished.config
     assert load_policy(path).evaluation["success_rate"] == 0.25
-    assert checksum(load_policy(path).params) == checksum(finished.state.learning.learner.params)
+    assert checksum(load_policy(path).params) == checksum(finished.state.learning.learner.target_params)
     assert rows(path)[-1]["eval/success_rate"] == 0.25
 
 

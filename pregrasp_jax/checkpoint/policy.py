@@ -21,7 +21,7 @@ from pregrasp_jax.config import Config, from_dict, to_dict
 FORMAT = 1
 """Version of the header of a policy."""
 
-PARAMS_PREFIX = "learning/learner/params/"
+PARAMS_PREFIX = "learning/learner/target_params/"
 """Where a training state keeps what a policy needs."""
 
 _PARAMS = "params.safetensors"

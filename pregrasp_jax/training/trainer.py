@@ -205,7 +205,7 @@ class Trainer:
         if progress.evaluated_at == progress.env_steps:
             return
         progress.evaluated_at = progress.env_steps
-        params = self.state.learning.learner.params
+        params = self.state.learning.learner.target_params  # the average is the better policy: it jumps less
         with progress.timed("evaluate"):
             measured = self.evaluate_fn(params)
         self._unsaved = True  # the best score is part of a checkpoint
