@@ -22,7 +22,7 @@ def make_params(step: int) -> dict:
 
 def make_tree(step: int) -> dict:
     return {
-        "learning": {"learner": {"params": make_params(step)}},
+        "learning": {"learner": {"target_params": make_params(step)}},
         "key": jax.random.split(jax.random.key(step), 2),
         "steps": jnp.int32(step),
         "ended": jnp.array([True, False]),
