@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from flax.errors import FlaxError
+
 from pregrasp_jax.cli.evaluate import refuse_unwritable
 from pregrasp_jax.cli.film import Decision, describe_decision, draw_tiles, make_play
 from pregrasp_jax.cli.player import EvaluationConfig, Player, make_player
@@ -41,7 +43,13 @@ def report(
     run = read_run(run_dir)
     documents = load_evaluations(run, evaluations)
     refuse_unwritable(html or run_dir / REPORT)
-    shown, note = play_films(run, films=films, scenes=scenes) if films else ([], "")
+    try:
+        shown, note = play_films(run, films=films, scenes=scenes) if films else ([], "")
+    except FlaxError:
+        raise ValueError(
+            f"the policy of {run_dir} does not fit its network in this version of the package; --films 0 writes the "
+            "report without episodes"
+        ) from None
     path = write_report(run, documents, shown, films_note=note, path=html)
     print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
 
@@ -92,7 +100,7 @@ def draw_film(player: Player, decisions: list[Decision]) -> Film:
     steps = [
         Step(describe_decision(player.env, decision)[-1], tuple(draw_tiles(player, decision))) for decision in decisions
     ]
-    return Film(f"{scene}, {target}: {ending}".replace("_", " "), decisions[-1].success, tuple(steps))
+    return Film(f"{scene}, {target}: {ending}", decisions[-1].success, tuple(steps))
 
 
 def _note(run: RunRecord, found: dict[bool, list[Any]], counts: dict[bool, int], played: int) -> str:

@@ -34,7 +34,7 @@ class Film:
     """One episode.
 
     Attributes:
-        title: scene, target and how it ended.
+        title: scene, target and how it ended; underscores are shown as spaces, here and in captions.
         success: whether it did so well.
         steps: in order, the last one is the end.
     """
@@ -50,21 +50,26 @@ def film_strips(films: Sequence[Film]) -> list[Markup]:
 
 
 def _film_strip(film: Film) -> Markup:
-    strip = element("ol", *(_step(film, step) for step in film.steps), class_="strip")
-    box = element("div", strip, class_="scroll", tabindex="0", role="region", aria_label=film.title)
+    title = _readable(film.title)
+    strip = element("ol", *(_step(step) for step in film.steps), class_="strip")
+    box = element("div", strip, class_="scroll", tabindex="0", role="region", aria_label=title)
     badge = element("span", "success" if film.success else "failure", class_="good" if film.success else "bad")
-    return element("article", element("h3", badge, " ", film.title), box)
+    return element("article", element("h3", badge, " ", title), box)
 
 
-def _step(film: Film, step: Step) -> Markup:
+def _step(step: Step) -> Markup:
     (scene, view), *maps = step.pictures
-    context = step.caption
+    context = _readable(step.caption)
     return element(
         "li",
-        element("p", step.caption),
+        element("p", context),
         _picture(view, f"{scene}: {context}", lossy=True),
         element("div", *(_map(caption, image, context) for caption, image in maps), class_="maps"),
     )
+
+
+def _readable(text: str) -> str:
+    return text.replace("_", " ")
 
 
 def _map(caption: str, image: np.ndarray, context: str) -> Markup:

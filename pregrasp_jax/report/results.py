@@ -23,7 +23,17 @@ _EPISODES = 100
 
 _TEXTS = ("policy", "object_set", "camera", "physics", "hull_bank_hash", "scene_bank_hash")
 
-_HEADER = ("policy", "objects", "camera", "scenes", "success", "95 % interval", "", "pushes per success", "this run is")
+_HEADER = (
+    "policy",
+    "objects",
+    "camera",
+    "scenes",
+    "success",
+    "95 % interval",
+    "",
+    "pushes per success",
+    "this run minus it",
+)
 
 
 def load_evaluations(run: RunRecord, files: Sequence[Path] = ()) -> list[dict[str, Any]]:
