@@ -45,6 +45,21 @@ def make_panel(
     Returns:
         [rows, columns, 3] uint8.
     """
+    tiles = make_tiles(hulls, obs, target_slot, p1=p1, mask=mask, q_values=q_values, action=action)
+    return _row(tiles, title=title, footer="maps: seen from above, +x right, +y up")
+
+
+def make_tiles(
+    hulls: HullInstances,
+    obs: Observation,
+    target_slot: int,
+    *,
+    p1: Sequence[float],
+    mask: np.ndarray,
+    q_values: np.ndarray | None = None,
+    action: int | None = None,
+) -> list[tuple[str, np.ndarray]]:
+    """Return the pictures of `make_panel`, each with its caption."""
     push_aperture, push = None, None
     if action is not None:
         row, col, push_aperture = (int(x) for x in grid.decode_action(jnp.int32(action)))
@@ -60,7 +75,7 @@ def make_panel(
         image = draw_q_map(values[..., aperture], mask, push=chosen, limits=limits, backdrop=np.asarray(obs.height))
         span = "" if q_values is None else f" {limits[0]:.2f} to {limits[1]:.2f}"
         tiles.append((f"{'push' if q_values is None else 'Q'} {name}{span}", image))
-    return _row(tiles, title=title, footer="maps: seen from above, +x right, +y up")
+    return tiles
 
 
 def contact_sheet(bank: HullBank, *, columns: int = 6) -> np.ndarray:
