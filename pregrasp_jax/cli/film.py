@@ -114,12 +114,21 @@ def _in_batch(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def draw_panel(player: Player, decision: Decision) -> np.ndarray:
     """Return scene | height | segmentation | Q closed | Q open, with the half ring and the chosen push."""
-    return drawing.make_panel(**_seen(player, decision), title=" | ".join(describe_decision(player.env, decision)))
+    return drawing.make_panel(draw_tiles(player, decision), title=" | ".join(describe_decision(player.env, decision)))
 
 
 def draw_tiles(player: Player, decision: Decision) -> list[tuple[str, np.ndarray]]:
     """Return the pictures of `draw_panel`, each with its caption."""
-    return drawing.make_tiles(**_seen(player, decision))
+    env, state = player.env, decision.state
+    return drawing.make_tiles(
+        _hulls(env.bank, state.scene, state.physics_obs),
+        state.obs,
+        int(state.scene.target),
+        p1=tuple(np.asarray(state.p1, float)),
+        mask=np.asarray(env.action_mask(state.p1)),
+        q_values=None if player.q_values is None else np.asarray(player.q_values(state)),
+        action=decision.action,
+    )
 
 
 def describe_decision(env: Env, decision: Decision) -> tuple[str, str, str]:
@@ -132,20 +141,6 @@ def describe_decision(env: Env, decision: Decision) -> tuple[str, str, str]:
     x, y = np.asarray(grid.cell_to_world(row, col))
     hand = "open" if aperture == OPEN else "closed"
     return scene, target, f"push {int(state.num_pushes) + 1}: {hand} to x {x:.2f} m, y {y:.2f} m"
-
-
-def _seen(player: Player, decision: Decision) -> dict[str, Any]:
-    """Return what there is to draw, as the arguments of `drawing.make_tiles`."""
-    env, state = player.env, decision.state
-    return {
-        "hulls": _hulls(env.bank, state.scene, state.physics_obs),
-        "obs": state.obs,
-        "target_slot": int(state.scene.target),
-        "p1": tuple(np.asarray(state.p1, float)),
-        "mask": np.asarray(env.action_mask(state.p1)),
-        "q_values": None if player.q_values is None else np.asarray(player.q_values(state)),
-        "action": decision.action,
-    }
 
 
 def _target_name(env: Env, state: EnvState) -> str:

@@ -5,8 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from flax.errors import FlaxError
-
 from pregrasp_jax.cli.evaluate import refuse_unwritable
 from pregrasp_jax.cli.film import Decision, describe_decision, draw_tiles, make_play
 from pregrasp_jax.cli.player import EvaluationConfig, Player, make_player
@@ -43,13 +41,7 @@ def report(
     run = read_run(run_dir)
     documents = load_evaluations(run, evaluations)
     refuse_unwritable(html or run_dir / REPORT)
-    try:
-        shown, note = play_films(run, films=films, scenes=scenes) if films else ([], "")
-    except FlaxError:
-        raise ValueError(
-            f"the policy of {run_dir} does not fit its network in this version of the package; --films 0 writes the "
-            "report without episodes"
-        ) from None
+    shown, note = play_films(run, films=films, scenes=scenes) if films else ([], "")
     path = write_report(run, documents, shown, films_note=note, path=html)
     print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
 

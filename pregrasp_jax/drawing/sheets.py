@@ -19,36 +19,6 @@ _INK, _PAPER = (38, 40, 44), (250, 249, 246)
 """Colours of text and background."""
 
 
-def make_panel(
-    hulls: HullInstances,
-    obs: Observation,
-    target_slot: int,
-    *,
-    p1: Sequence[float],
-    mask: np.ndarray,
-    q_values: np.ndarray | None = None,
-    action: int | None = None,
-    title: str = "",
-) -> np.ndarray:
-    """Draw scene | height | segmentation | Q closed | Q open, with the half ring and the chosen push.
-
-    Args:
-        hulls: what stands on the table (unbatched).
-        obs: what the policy sees.
-        target_slot: the slot of the target.
-        p1: (x, y) m, where the push starts.
-        mask: [H, W] bool, where it may end.
-        q_values: [H, W, 2], or None for a policy without Q-values.
-        action: flat index of the chosen push, drawn on the map of its aperture.
-        title: one line above the panel.
-
-    Returns:
-        [rows, columns, 3] uint8.
-    """
-    tiles = make_tiles(hulls, obs, target_slot, p1=p1, mask=mask, q_values=q_values, action=action)
-    return _row(tiles, title=title, footer="maps: seen from above, +x right, +y up")
-
-
 def make_tiles(
     hulls: HullInstances,
     obs: Observation,
@@ -59,7 +29,20 @@ def make_tiles(
     q_values: np.ndarray | None = None,
     action: int | None = None,
 ) -> list[tuple[str, np.ndarray]]:
-    """Return the pictures of `make_panel`, each with its caption."""
+    """Draw scene, height, segmentation, Q closed, Q open, with the half ring and the chosen push.
+
+    Args:
+        hulls: what stands on the table (unbatched).
+        obs: what the policy sees.
+        target_slot: the slot of the target.
+        p1: (x, y) m, where the push starts.
+        mask: [H, W] bool, where it may end.
+        q_values: [H, W, 2], or None for a policy without Q-values.
+        action: flat index of the chosen push, drawn on the map of its aperture.
+
+    Returns:
+        (caption, image [rows, columns, 3] uint8) of each.
+    """
     push_aperture, push = None, None
     if action is not None:
         row, col, push_aperture = (int(x) for x in grid.decode_action(jnp.int32(action)))
@@ -76,6 +59,11 @@ def make_tiles(
         span = "" if q_values is None else f" {limits[0]:.2f} to {limits[1]:.2f}"
         tiles.append((f"{'push' if q_values is None else 'Q'} {name}{span}", image))
     return tiles
+
+
+def make_panel(tiles: Sequence[tuple[str, np.ndarray]], *, title: str = "") -> np.ndarray:
+    """Return the pictures of `make_tiles` side by side under one line of text, [rows, columns, 3] uint8."""
+    return _row(tiles, title=title, footer="maps: seen from above, +x right, +y up")
 
 
 def contact_sheet(bank: HullBank, *, columns: int = 6) -> np.ndarray:

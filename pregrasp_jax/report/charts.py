@@ -7,9 +7,7 @@ from typing import Any
 from pregrasp_jax.report.markup import Markup, element, join
 from pregrasp_jax.report.record import SECONDS, RunRecord, is_number
 from pregrasp_jax.report.svg import Point, Series, bar_chart, line_chart
-
-PHASES = ("collect", "learn", "evaluate", "checkpoint")
-"""What the training loop spends its time on (`training.trainer.PHASES`)."""
+from pregrasp_jax.training.trainer import PHASES
 
 RECENT_EPISODES = 1000
 """Training episodes whose ends are counted, at least."""
