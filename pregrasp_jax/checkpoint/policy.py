@@ -101,6 +101,8 @@ def _read_policy(path: Path) -> Policy:
         evaluation, expected = json.loads(metadata["evaluation"]), metadata["checksum"]
     except (KeyError, json.JSONDecodeError):
         raise ValueError(f"{path} was not written by this package: its header names no config") from None
+    except ValueError as error:
+        raise ValueError(f"{path} was written by another version of this package: {error}") from None
     params = trees.nest(arrays)
     if trees.checksum(params) != expected:
         raise DamagedFileError(f"{path} is altered (checksum differs)")
