@@ -28,7 +28,7 @@ def refuse_unwritable(path: Path) -> None:
     """
     folder = next(parent for parent in path.absolute().parents if parent.exists())
     if not (folder.is_dir() and os.access(folder, os.W_OK)):
-        raise ValueError(f"{path} cannot be written: {folder} is not a writable folder")
+        raise ValueError(f"{path} cannot be written: {folder} is not a writable folder; allowed is one that is")
 
 
 def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:

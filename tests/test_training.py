@@ -169,16 +169,7 @@ def test_a_folder_is_used_by_one_process(tmp_path):
     RunFolder.open(tmp_path / "run", config)
 
 
-def test_folder_refusals(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match="is a file"):
-        RunFolder.create(tmp_path / "file", make_config())
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "thesis.tex").write_text("")
-    with pytest.raises(ValueError, match="is not empty and holds no run"):
-        RunFolder.create(tmp_path / "full", make_config())
-    with pytest.raises(ValueError, match="is not a run folder"):
-        RunFolder.open(tmp_path / "full", make_config())
+def test_a_run_keeps_its_objects_and_scenes(tmp_path):
     with RunFolder.create(tmp_path / "run", make_config()) as folder:
         folder.begin_session({"hull bank": "a", "training scenes": "b"})
         with pytest.raises(ValueError, match=r"another training scenes \(b, now c\)"):
@@ -280,17 +271,13 @@ def test_the_learner_measures_what_the_report_prints(monkeypatch):
     assert measured == set(learn.METRICS)
 
 
-def test_too_little_memory_or_disk_is_refused_before_the_start(tmp_path, monkeypatch):
+def test_what_a_run_needs_is_estimated(tmp_path, monkeypatch):
     rest, ring = make_program(make_config()).shapes().split()
     assert resources.num_bytes(ring) == 70 * (2 * 100 * 100 + 2 * 4)
     resources.check(rest, ring, tmp_path / "new" / "run")
     assert not (tmp_path / "new").exists()
     monkeypatch.setattr(resources, "available_memory", lambda: 10**6)
     with pytest.raises(ValueError, match=r"needs about 0.5\d GB of memory, 0.00 GB are free; a smaller replay.capac"):
-        resources.check(rest, ring, tmp_path)
-    monkeypatch.setattr(resources, "available_memory", lambda: None)
-    monkeypatch.setattr(resources, "available_disk", lambda path: 10**5)
-    with pytest.raises(ValueError, match=r"GB of disk at .*0.00 GB are free"):
         resources.check(rest, ring, tmp_path)
 
 

@@ -118,13 +118,15 @@ def restore(folder: Path, template: Any, ring_template: Any) -> Restored:
         except DamagedFileError as error:
             damaged[path] = str(error)
             continue
+        except ValueError as error:
+            raise ValueError(f"{error}; allowed is a checkpoint of the same configuration and version") from None
         for broken in damaged:
             _set_aside(broken)
         return Restored(manifest["step"], tree, ring, manifest["extra"], tuple(damaged.values()))
     if damaged:
         raise ValueError(
-            f"{folder}: none of {len(damaged)} checkpoints is intact; newest: {next(iter(damaged.values()))}; "
-            "--init-from starts a new run from its best policy"
+            f"{folder}: none of {len(damaged)} checkpoints is intact; newest: {next(iter(damaged.values()))}; allowed is "
+            "a run with one that is; --init-from starts a new run from its best policy"
         )
     raise ValueError(f"{folder} holds no checkpoint")
 

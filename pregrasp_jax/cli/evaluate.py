@@ -47,5 +47,5 @@ def refuse_unwritable(path: Path | None) -> None:
     if path is None:
         return
     if path.is_dir():
-        raise ValueError(f"{path} is a folder; wanted the name of a file")
+        raise ValueError(f"{path} is a folder; allowed is the name of a file")
     io.refuse_unwritable(path)

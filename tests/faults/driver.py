@@ -10,7 +10,6 @@ import conftest  # noqa: F401  (the settings and the compiled programs of the te
 
 # isort: split
 import dataclasses
-import importlib.util
 import io as text_io
 import itertools
 import os
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import fake_training
+from scripts import load_script
 
 from pregrasp_jax import io
 from pregrasp_jax.training import session
@@ -86,11 +86,7 @@ def main() -> int:
     world.make_program = lambda env, config, **_: fake_training.make_program(config, env)
     world.make_evaluate = lambda env, config: fake_training.evaluate
     sys.argv = ["train.py", *arguments]
-    spec = importlib.util.spec_from_file_location("train", Path(__file__).parents[2] / "train.py")
-    assert spec and spec.loader
-    train = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(train)
-    return train.main()
+    return load_script("train").main()
 
 
 if __name__ == "__main__":
