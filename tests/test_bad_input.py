@@ -34,6 +34,10 @@ COMMAND_LINES = [
     ("train ci --run-dir {w}/new --task.r-in 3", "task.r_in = 3.0 is out of range; allowed is 0.005 to 0.5"),
     ("train ci --run-dir {w}/new --learner.learning-rate nan", "learner.learning_rate = nan is out of range; allowed"),
     ("train ci --run-dir {w}/new --scene.min-objects 7 --scene.max-objects 6", "scene.min_objects = 7 must not exceed"),
+    (
+        "train ci --run-dir {w}/new --network.width 1 --replay.capacity 64 --train.num-envs 3",
+        "replay capacity = 64 is too small for 3 scenes and episodes of 10 pushes; allowed is 66 or more",
+    ),
     ("evaluate", "Missing from", "--policy STR"),
     ("evaluate --policy clear --object-set old", "Expected one of ('seen', 'unseen')"),
     ("evaluate --policy clear --episode x", "Unrecognized options: --episode, x (--episodes INT)"),
