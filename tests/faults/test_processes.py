@@ -68,10 +68,14 @@ def assert_equal_runs(trainer: Trainer, whole: Trainer) -> None:
     ("moment", "count", "steps_kept"),
     [
         ("collect", 6, 5),
-        ("update", 2, 5),  # the warm-up is 9 pushes: updates are due in the steps 5 and 6 of 3 pushes
+        pytest.param(
+            "update", 2, 5, marks=pytest.mark.slow
+        ),  # the warm-up is 9 pushes: updates are due in the steps 5 and 6 of 3 pushes
         (".npz", 4, 3),  # the checkpoint of step 0 has no observations
         ("state.safetensors", 1, None),
-        ("manifest.json", 6, 3),  # the first one is that of the run, the second that of step 0
+        pytest.param(
+            "manifest.json", 6, 3, marks=pytest.mark.slow
+        ),  # the first one is that of the run, the second that of step 0
     ],
 )
 def test_a_killed_run_loses_the_step_under_way_and_nothing_else(tmp_path, whole, moment, count, steps_kept):
@@ -103,6 +107,7 @@ def read_until(process: subprocess.Popen[str], end: str) -> list[str]:
 STOPPING = "stopping: this step is finished and a checkpoint is written; a second signal ends at once"
 
 
+@pytest.mark.slow
 def test_sigterm_ends_with_a_checkpoint_and_says_how_to_go_on(tmp_path, whole):
     path = tmp_path / "run"
     with training(path, "wait", "collect", "4") as process:
