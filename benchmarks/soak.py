@@ -51,7 +51,7 @@ def num_astray(states: EnvState, outcome: Any) -> int:
     below = (present & (poses[..., 2] < MIN_HEIGHT)).any(axis=1)
     measured = (states.physics_obs, states.obs, states.centroids, states.p1, outcome)
     infinite = [
-        ~np.isfinite(np.asarray(leaf).reshape(len(below), -1)).all(axis=1) for leaf in jax.tree.leaves(measured)
+        ~np.isfinite(np.asarray(leaf).reshape(len(present), -1)).all(axis=1) for leaf in jax.tree.leaves(measured)
     ]
     return int(((below | np.any(infinite, axis=0)) & ~np.asarray(outcome.diverged)).sum())
 

@@ -41,9 +41,9 @@ def make_bad_runs(folder: Path) -> None:
     ring = Ring({"height": np.zeros((2, 2), np.uint8)}, 1)
     for name in ("foreign", "damaged"):
         write_config(folder / name / "config.yaml", make_config())
-        checkpoint = save(folder / name / "checkpoints", 7, {"colour": np.zeros(3)}, ring, {})
+        save(folder / name / "checkpoints", 7, {"colour": np.zeros(3)}, ring, {})
         (folder / name / "manifest.json").write_text(json.dumps({"hashes": FAKE_HASHES, "sessions": []}))
-    flip_last_byte(checkpoint / "state.safetensors")
+    flip_last_byte(folder / "damaged" / "checkpoints" / "000000007" / "state.safetensors")
 
 
 def make_bad_policies(folder: Path) -> None:

@@ -125,8 +125,8 @@ def restore(folder: Path, template: Any, ring_template: Any) -> Restored:
         return Restored(manifest["step"], tree, ring, manifest["extra"], tuple(damaged.values()))
     if damaged:
         raise ValueError(
-            f"{folder}: none of {len(damaged)} checkpoints is intact; newest: {next(iter(damaged.values()))}; allowed is "
-            "a run with one that is; --init-from starts a new run from its best policy"
+            f"{folder}: none of {len(damaged)} checkpoints is intact; newest: {next(iter(damaged.values()))}; allowed "
+            "is a run with one that is; --init-from starts a new run from its best policy"
         )
     raise ValueError(f"{folder} holds no checkpoint")
 

@@ -64,18 +64,16 @@ def assert_equal_runs(trainer: Trainer, whole: Trainer) -> None:
     assert timeless(trainer.folder.path) == timeless(whole.folder.path)
 
 
+# The warm-up is 9 pushes, so that updates are due in the steps 5 and 6 of 3 pushes. The checkpoint of step 0 has no
+# observations; the first manifest is that of the run.
 @pytest.mark.parametrize(
     ("moment", "count", "steps_kept"),
     [
         ("collect", 6, 5),
-        pytest.param(
-            "update", 2, 5, marks=pytest.mark.slow
-        ),  # the warm-up is 9 pushes: updates are due in the steps 5 and 6 of 3 pushes
-        (".npz", 4, 3),  # the checkpoint of step 0 has no observations
+        pytest.param("update", 2, 5, marks=pytest.mark.slow),
+        (".npz", 4, 3),
         ("state.safetensors", 1, None),
-        pytest.param(
-            "manifest.json", 6, 3, marks=pytest.mark.slow
-        ),  # the first one is that of the run, the second that of step 0
+        pytest.param("manifest.json", 6, 3, marks=pytest.mark.slow),
     ],
 )
 def test_a_killed_run_loses_the_step_under_way_and_nothing_else(tmp_path, whole, moment, count, steps_kept):
