@@ -53,7 +53,7 @@ class TaskConfig:
     r_in: float = 0.04
     """m, inner radius of the half ring (Eq. 1)."""
     r_out: float = 0.20
-    """m, outer radius of the half ring (Eq. 1). Of 0.10, 0.15 and 0.20, `lookahead` succeeds most often at 0.20."""
+    """m, outer radius of the half ring (Eq. 1). `lookahead` does better at 0.20 than at 0.15 (docs/task.md)."""
     full_ring: bool = False
     """Allow backward pushes too: the paper's Full-Ring ablation."""
     max_pushes: int = 10

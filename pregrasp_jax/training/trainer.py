@@ -210,7 +210,8 @@ class Trainer:
             measured = self.evaluate_fn(params)
         self._unsaved = True  # the best score is part of a checkpoint
         where = {"env_steps": progress.env_steps, "episodes": progress.episodes}
-        row = where | {f"eval/{name}": value for name, value in measured.items()}
+        row = where | {"time/seconds": progress.total_seconds}
+        row |= {f"eval/{name}": value for name, value in measured.items()}
         self._write("metrics", lambda: self.folder.append_metrics(row))
         if progress.best is None or measured["success_rate"] >= progress.best:
             progress.best = measured["success_rate"]
