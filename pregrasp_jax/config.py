@@ -164,6 +164,8 @@ class TrainConfig:
     """Env steps between evaluations on the validation scenes; 0 evaluates only at the end."""
     log_every: int = 200
     """Env steps between rows of metrics.jsonl."""
+    tensorboard: bool = False
+    """Write the same numbers for TensorBoard, into the run folder (needs the extra `tensorboard`)."""
 
 
 @dataclass(frozen=True, kw_only=True)

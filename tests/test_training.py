@@ -221,6 +221,17 @@ def test_resume_repeats_what_a_crash_lost(tmp_path, finished):
     assert timeless(path) == timeless(finished.folder.path)
 
 
+def test_every_session_leaves_an_event_file_if_asked(tmp_path):
+    pytest.importorskip("tensorboardX")
+    path, config = tmp_path / "run", make_config(episodes=12, tensorboard=True)
+    run(path, config, stop=stop_after(3))
+    run(path, config, resume=True)
+    sizes = [file.stat().st_size for file in sorted((path / "tensorboard").iterdir())]
+    assert len(sizes) == 2 and min(sizes) > 500
+    run(tmp_path / "silent", make_config(episodes=1))
+    assert not (tmp_path / "silent" / "tensorboard").exists()
+
+
 def test_a_run_can_be_extended_but_not_changed(tmp_path):
     path, config = tmp_path / "run", make_config(episodes=6)
     first = run(path, config)

@@ -97,6 +97,8 @@ class Trainer:
     def begin(self) -> None:
         """Start from the seed, and write the checkpoint of step 0."""
         self.state = jax.jit(self.program.init)(jax.random.key(self.config.seed))
+        if self.config.train.tensorboard:
+            self.folder.begin_event_log()
         self.save()
 
     def resume(self) -> None:
@@ -112,6 +114,8 @@ class Trainer:
         self.state = restored.tree.join(restored.ring)
         self.progress = Progress(**restored.extra)
         self.folder.forget_metrics_after(restored.step)
+        if self.config.train.tensorboard:
+            self.folder.begin_event_log(resumed_at=restored.step)
         self._saved_at, self._tried_to_save_at, self._unsaved = restored.step, self.progress.total_seconds, False
         self._logged_at = (restored.step, self.progress.total_seconds)
         self.console.say(f"resuming {self.folder.path} at step {restored.step}, episode {self.progress.episodes}")
