@@ -53,7 +53,7 @@ class TaskConfig:
     r_in: float = 0.04
     """m, inner radius of the half ring (Eq. 1)."""
     r_out: float = 0.20
-    """m, outer radius of the half ring (Eq. 1). Of 0.10, 0.15 and 0.20, `lookahead` succeeds most often at 0.20."""
+    """m, outer radius of the half ring (Eq. 1). `lookahead` does better at 0.20 than at 0.15 (docs/task.md)."""
     full_ring: bool = False
     """Allow backward pushes too: the paper's Full-Ring ablation."""
     max_pushes: int = 10
@@ -164,6 +164,8 @@ class TrainConfig:
     """Env steps between evaluations on the validation scenes; 0 evaluates only at the end."""
     log_every: int = 200
     """Env steps between rows of metrics.jsonl."""
+    tensorboard: bool = False
+    """Write the same numbers for TensorBoard, into the run folder (needs the extra `tensorboard`)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ from pregrasp_jax.learning.compact import (
     PATCH,
     CompactNetwork,
     Window,
+    coordinates,
     look_around_hand,
     paste,
     patches,
@@ -104,9 +105,23 @@ def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window
     assert whole[2, 80, 4, 1] != 0.0
 
 
+def test_coordinates_say_where_patches_lie_in_the_window_and_on_the_table():
+    window = Window(jnp.zeros((2, 8, 12, 3)), jnp.array([[0, 0], [-4, 90]]))
+    found = np.asarray(coordinates(window))
+    assert found.shape == (2, 2, 3, 8)
+    for scene, (first_row, first_col) in enumerate(window.origin.tolist()):
+        for row, col in np.ndindex(2, 3):
+            # Metres of the patch's centre: the middle of its 4 x 4 cells of 5 mm, 0.25 m at the edge of the table.
+            y, x = (0.005 * (4 * index + first + 2) - 0.25 for index, first in ((row, first_row), (col, first_col)))
+            expected = [-0.5 + row, (col - 1) / 1.5, y / 0.25, x / 0.25]
+            np.testing.assert_allclose(found[scene, row, col], [*expected, *np.square(expected)], atol=1e-6)
+
+
 def test_values_move_with_the_hand_and_the_scene():
-    """The same surroundings two patches further give the same values two patches further."""
+    """The same surroundings two patches further give the same values two patches further, but for the table's edge."""
     network, params, _ = make_network()
+    stem = params["params"]["stem"]
+    stem["kernel"] = stem["kernel"].at[:, :, -8:].set(0.0)  # does not look where on the table it is
     q = jax.jit(
         lambda obs: network.apply(
             params, jax.tree.map(lambda x: x[None], look_around_hand(obs, jnp.int32(0), size=SIZE))
@@ -124,7 +139,7 @@ def test_untrained_it_promises_its_bias_everywhere_and_learns_in_every_layer():
     config = PRESETS["cpu"]
     q = make_q_function(config.network, config.task)
     params = q.init(jax.random.key(0))
-    assert num_parameters(params) == 115_618  # also the size that config.py and README name
+    assert num_parameters(params) == 117_922  # also the size that config.py and README name
     values = q.values(params, observation(START), jnp.int32(0))
     mask = primitives.half_ring_mask(jnp.asarray(START), r_in=config.task.r_in, r_out=config.task.r_out)
     np.testing.assert_allclose(values[mask], 0.5, atol=0.05)

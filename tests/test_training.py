@@ -94,7 +94,8 @@ def test_a_finished_run_leaves_everything(finished):
     assert stored_config(path) == finished.config
     assert load_policy(path).evaluation["success_rate"] == 0.25
     assert checksum(load_policy(path).params) == checksum(finished.state.learning.learner.target_params)
-    assert rows(path)[-1]["eval/success_rate"] == 0.25
+    last = rows(path)[-1]
+    assert last["eval/success_rate"] == 0.25 and last["time/seconds"] > 0
 
 
 def test_same_seed_same_metrics(tmp_path, finished):
@@ -127,6 +128,17 @@ def test_resume_repeats_what_a_crash_lost(tmp_path, finished):
     second = run(path, finished.config, resume=True)
     assert checksum(second.state) == checksum(finished.state)
     assert timeless(path) == timeless(finished.folder.path)
+
+
+def test_every_session_leaves_an_event_file_if_asked(tmp_path):
+    pytest.importorskip("tensorboardX")
+    path, config = tmp_path / "run", make_config(episodes=12, tensorboard=True)
+    run(path, config, stop=stop_after(3))
+    run(path, config, resume=True)
+    sizes = [file.stat().st_size for file in sorted((path / "tensorboard").iterdir())]
+    assert len(sizes) == 2 and min(sizes) > 500
+    run(tmp_path / "silent", make_config(episodes=1))
+    assert not (tmp_path / "silent" / "tensorboard").exists()
 
 
 def test_a_run_can_be_extended_but_not_changed(tmp_path):
@@ -207,6 +219,20 @@ def test_initial_parameters_are_used(tmp_path):
 def test_updates_due_add_up_over_fractions():
     config = dataclasses.replace(PRESETS["ci"].learner, warmup=10, updates_per_step=0.3)
     assert [learn.num_updates(steps, config) for steps in (0, 10, 13, 14, 17, 20, 110)] == [0, 0, 0, 1, 2, 3, 30]
+
+
+def test_the_step_size_decays_linearly_and_stays():
+    steady = dataclasses.replace(PRESETS["ci"].learner, learning_rate=0.1, learning_rate_steps=0)
+    decaying = dataclasses.replace(steady, final_learning_rate=0.02, learning_rate_steps=4)
+    for config, expected in ((steady, [0.1] * 7), (decaying, [0.1, 0.08, 0.06, 0.04, 0.02, 0.02, 0.02])):
+        optimizer = learn.make_optimizer(config)
+        state, sizes = optimizer.init(jnp.float32(0)), []
+        for _ in expected:
+            step, state = optimizer.update(jnp.float32(3), state)
+            sizes.append(-float(jnp.asarray(step)))
+        assert sizes == pytest.approx(expected, rel=1e-4), (
+            "a constant gradient makes every step of Adam one of its size"
+        )
 
 
 def test_tally_keeps_the_reasons_of_the_last_episodes():

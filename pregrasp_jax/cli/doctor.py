@@ -11,7 +11,11 @@ from pregrasp_jax import io
 from pregrasp_jax.machine import versions
 from pregrasp_jax.training import resources
 
-_OPTIONAL = {"warp": "engine warp", "tensorboardX": "TensorBoard log", "OpenGL": "not needed: pictures use no GL"}
+_OPTIONAL = {
+    "warp": "engine warp",
+    "tensorboardX": "train.tensorboard",
+    "OpenGL": "not needed: pictures use no GL",
+}
 
 
 def describe() -> list[tuple[str, str]]:

@@ -5,6 +5,7 @@ Inside it a patch of 4x4 cells is one position with all of its 16 pixels as chan
 0.22 m in every direction. At 32 channels an update costs a fifth of the paper's network at width 0.25.
 
 Because the window moves with the hand, the network also knows where the hand is while it is still outside the picture.
+It is told where every patch lies, in the window and on the table: the edges over which things fall are seldom in view.
 """
 
 import math
@@ -141,7 +142,8 @@ class CompactNetwork(nn.Module):
         assert x.ndim == 4 and x.shape[-1] == 3, f"expected [B, R, C, 3], got {x.shape}"
         assert x.shape[1] % PATCH == 0 and x.shape[2] % PATCH == 0, f"R and C must be divisible by {PATCH}: {x.shape}"
         float32, he = jnp.dtype(jnp.float32), nn.initializers.he_normal()
-        x = nn.relu(Conv(self.channels, 3, he, float32, name="stem")(patches(_label_channels(x))))
+        x = jnp.concatenate([patches(_label_channels(x)), coordinates(window)], axis=-1)
+        x = nn.relu(Conv(self.channels, 3, he, float32, name="stem")(x))
         for i in range(self.blocks):
             hidden = nn.relu(Conv(self.channels, 3, he, float32, name=f"block{i}_in")(x))
             # Zero at first: a network of identities learns from the first update on.
@@ -158,6 +160,32 @@ def patches(x: jax.Array) -> jax.Array:
     batch, rows, cols, channels = x.shape
     x = x.reshape(batch, rows // PATCH, PATCH, cols // PATCH, PATCH, channels)
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(batch, rows // PATCH, cols // PATCH, PATCH**2 * channels)
+
+
+def coordinates(window: Window) -> jax.Array:
+    """Return where the patches of B windows lie.
+
+    Args:
+        window: of B scenes.
+
+    Returns:
+        [B, R / 4, C / 4, 8] float32: row and col of the patch's centre in the window, from -1 to 1, the same on the
+        table, and the squares of these four.
+    """
+    batch, *size = window.images.shape[:3]
+    cells = [PATCH * jnp.arange(length // PATCH) + (PATCH - 1) / 2 for length in size]
+    in_window = jnp.stack(jnp.meshgrid(*cells, indexing="ij"), axis=-1)
+    on_table = window.origin[:, None, None] + in_window[None]
+
+    def scaled(cell: jax.Array, length: jax.Array) -> jax.Array:
+        """Map the outer edges of `length` cells to -1 and 1."""
+        return (2 * cell + 1) / length - 1
+
+    shape = (batch, *in_window.shape)
+    here = jnp.broadcast_to(scaled(in_window, jnp.array(size).reshape(1, 1, 2)), shape)
+    there = scaled(on_table, jnp.full((1, 1, 1, 1), grid.GRID_SIZE))
+    both = jnp.concatenate([here, there], axis=-1)
+    return jnp.concatenate([both, both**2], axis=-1)
 
 
 def _label_channels(images: jax.Array) -> jax.Array:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
-import numpy as np
 import yaml
 
 from pregrasp_jax.report.svg import Point
@@ -24,7 +23,7 @@ class RunRecord:
         path: of the folder.
         config: content of config.yaml.
         manifest: content of manifest.json, empty if there is none.
-        metrics: rows of metrics.jsonl; rows of evaluations have `time/seconds` too, from the rows around them.
+        metrics: rows of metrics.jsonl.
         best: what was measured on the validation scenes when the best policy was saved, empty if none was.
     """
 
@@ -78,7 +77,7 @@ def read_run(path: Path) -> RunRecord:
         path=path,
         config=config,
         manifest=_read_object(path / "manifest.json"),
-        metrics=_with_times(_read_rows(path / "metrics.jsonl")),
+        metrics=_read_rows(path / "metrics.jsonl"),
         best=_read_object(path / "best" / "evaluation.json"),
     )
 
@@ -111,12 +110,3 @@ def _read_rows(path: Path) -> list[dict[str, Any]]:
             raise ValueError(f"{path}: line {index} is damaged, it has no env_steps")
         rows.append(row)
     return rows
-
-
-def _with_times(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return rows of which those without a training time have that of their env steps."""
-    known = sorted((row["env_steps"], row[SECONDS]) for row in rows if is_number(row.get(SECONDS)))
-    if not known:
-        return rows
-    steps, seconds = zip(*known, strict=True)
-    return [{SECONDS: float(np.interp(row["env_steps"], steps, seconds)), **row} for row in rows]

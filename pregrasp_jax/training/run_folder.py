@@ -1,6 +1,6 @@
 """The folder of a run: who may write to it, and its files beside the checkpoints.
 
-runs/NAME/: config.yaml, manifest.json, metrics.jsonl, checkpoints/, best/, run.lock.
+runs/NAME/: config.yaml, manifest.json, metrics.jsonl, tensorboard/ (if asked for), checkpoints/, best/, run.lock.
 """
 
 import datetime
@@ -19,9 +19,10 @@ from pregrasp_jax.checkpoint.policy import read_config, write_config
 from pregrasp_jax.checkpoint.state import exists
 from pregrasp_jax.config import Config, difference
 from pregrasp_jax.machine import versions
+from pregrasp_jax.training.event_log import EventLog
 
-EXTENDABLE = ("train.minutes", "train.episodes")
-"""Settings that may change when a run is resumed: they say when it stops, not what it does."""
+EXTENDABLE = ("train.minutes", "train.episodes", "train.tensorboard")
+"""Settings that may change when a run is resumed: they say when it stops and what it tells, not what it does."""
 
 
 class RunFolder:
@@ -31,6 +32,7 @@ class RunFolder:
         """Hold the lock; use `create` or `open`."""
         self.path = path
         self._lock = lock
+        self._event_log: EventLog | None = None
 
     @property
     def checkpoints(self) -> Path:
@@ -111,6 +113,10 @@ class RunFolder:
         }
         io.write_json(file, manifest | {"sessions": [*manifest["sessions"], session]})
 
+    def begin_event_log(self, *, resumed_at: int | None = None) -> None:
+        """Write what is appended to metrics.jsonl to TensorBoard's files too (see `EventLog`)."""
+        self._event_log = EventLog(self.path / "tensorboard", resumed_at=resumed_at)
+
     def append_metrics(self, row: dict[str, Any]) -> None:
         """Append one row to metrics.jsonl, whole or not at all.
 
@@ -123,6 +129,8 @@ class RunFolder:
             if file.write(data) < len(data):  # what a full disk does at first; only the next write raises
                 file.truncate(length)
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), file.name)
+        if self._event_log:
+            self._event_log.append(row)
 
     def forget_metrics_after(self, env_steps: int) -> None:
         """Drop the rows later than a checkpoint, which will be measured again, and a last line that was cut."""

@@ -12,6 +12,7 @@ from pregrasp_jax.learning.learner import Params
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.training import resources
 from pregrasp_jax.training.console import Console
+from pregrasp_jax.training.event_log import require_module
 from pregrasp_jax.training.interrupt import Interrupt
 from pregrasp_jax.training.program import enable_compilation_cache, make_program
 from pregrasp_jax.training.run_folder import RunFolder, refuse_used
@@ -58,6 +59,8 @@ def resume(config: Config, run_dir: Path, *, console: Console | None = None) -> 
 def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
     enable_compilation_cache()
     config.validate()
+    if config.train.tensorboard:
+        require_module()
     env = _load(config, "train", console)
     validation = _load(config, "validation", console)
     program = make_program(env, config, params=params)

@@ -101,6 +101,8 @@ class Trainer:
             ValueError: it cannot be written, so no later one could.
         """
         self.state = jax.jit(self.program.init)(jax.random.key(self.config.seed))
+        if self.config.train.tensorboard:
+            self.folder.begin_event_log()
         self.save()
         if not self.saved:
             raise ValueError(f"no checkpoint can be written to {self.folder.path}; allowed is a disk with room for it")
@@ -118,6 +120,8 @@ class Trainer:
         self.state = restored.tree.join(restored.ring)
         self.progress = Progress(**restored.extra)
         self.folder.forget_metrics_after(restored.step)
+        if self.config.train.tensorboard:
+            self.folder.begin_event_log(resumed_at=restored.step)
         self._saved_at, self._tried_to_save_at, self._unsaved = restored.step, self.progress.total_seconds, False
         self._logged_at = (restored.step, self.progress.total_seconds)
         self.console.say(f"resuming {self.folder.path} at step {restored.step}, episode {self.progress.episodes}")
@@ -217,7 +221,8 @@ class Trainer:
             measured = self.evaluate_fn(params)
         self._unsaved = True  # the best score is part of a checkpoint
         where = {"env_steps": progress.env_steps, "episodes": progress.episodes}
-        row = where | {f"eval/{name}": value for name, value in measured.items()}
+        row = where | {"time/seconds": progress.total_seconds}
+        row |= {f"eval/{name}": value for name, value in measured.items()}
         self._write("metrics", lambda: self.folder.append_metrics(row))
         if progress.best is None or measured["success_rate"] >= progress.best:
             progress.best = measured["success_rate"]
