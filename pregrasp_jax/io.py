@@ -10,6 +10,9 @@ from typing import Any, BinaryIO, cast
 
 import numpy as np
 
+PARTIAL = ".partial"
+"""Ending of files that are being written."""
+
 
 def cache_dir() -> Path:
     """Return the folder of rebuildable files: ``$PREGRASP_JAX_CACHE``, or ``pregrasp_jax`` in the user's cache."""
@@ -17,10 +20,25 @@ def cache_dir() -> Path:
     return Path(os.environ.get("PREGRASP_JAX_CACHE") or default)
 
 
+def refuse_unwritable(path: Path) -> None:
+    """Refuse a file or folder that could not be written, before hours of work are spent on its content.
+
+    Raises:
+        ValueError: its folder, or the nearest one that exists, does not allow writing.
+    """
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    if not (folder.is_dir() and os.access(folder, os.W_OK)):
+        raise ValueError(f"{path} cannot be written: {folder} is not a writable folder; allowed is one that is")
+
+
 def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Let `write` fill a temporary file beside `path`, flush it to disk, then rename it over `path`."""
+    """Let `write` fill a temporary file beside `path`, flush it to disk, then rename it over `path`.
+
+    Raises:
+        OSError: the disk is full or does not allow it; its `filename` is set.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=PARTIAL, dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
             write(file)
@@ -28,9 +46,17 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:
             os.fsync(file.fileno())
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         Path(temporary).unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno and not error.filename:
+            error.filename = str(path)  # a full disk does not say which file it was
         raise
+
+
+def sweep(folder: Path) -> None:
+    """Delete what writers that were killed have left anywhere under `folder`; nobody else may be writing there."""
+    for path in folder.rglob(f".*{PARTIAL}"):
+        path.unlink(missing_ok=True)
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -133,7 +133,9 @@ def compare(a: Mapping[str, Any], b: Mapping[str, Any]) -> Comparison:
     """
     for key in _SAME:
         if a[key] != b[key]:
-            raise ValueError(f"cannot pair: {key} is {a[key]} in the first file and {b[key]} in the second")
+            raise ValueError(
+                f"cannot pair: {key} is {a[key]} in the first file and {b[key]} in the second; allowed are equal ones"
+            )
     rows_a, rows_b = _by_scene(a["rows"]), _by_scene(b["rows"])
     if alone := sorted(rows_a.keys() ^ rows_b.keys()):
         raise ValueError(f"cannot pair: {len(alone)} scenes are in one file only, the first is scene {alone[0]}")

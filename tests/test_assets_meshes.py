@@ -1,4 +1,4 @@
-"""Folders of meshes: what loads, what is refused and why, settings, cache, and the table."""
+"""Folders of meshes: what loads, settings, cache, and the table; what is refused is in test_bad_input."""
 
 import os
 import shutil
@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from trimesh.exchange.obj import export_obj
 
 from pregrasp_jax.assets import mesh_file, meshes
 from pregrasp_jax.assets.catalogue import builtin_bank
@@ -59,36 +58,14 @@ def mixed(tmp_path_factory):
     write(folder / "d_scene.glb", box(0.05, 0.05, 0.2))
     write(folder / "e_twin.stl", box(0.05, 0.06, 0.12))
     write(folder / "e_twin.obj", box(0.06, 0.06, 0.12))
-    bad = {
-        "flat.stl": box(0.05, 0.004, 0.15),
-        "huge.stl": box(60, 70, 150),
-        "low.stl": box(0.06, 0.06, 0.09),
-        "slanted.stl": box(0.03, 0.03, 0.28),
-        "tall.stl": box(0.08, 0.08, 0.31),
-        "tiny.stl": box(6e-5, 7e-5, 15e-5),
-        "wide.stl": box(0.21, 0.05, 0.15),
-    }
-    bad["slanted.stl"].vertices[:, 0] += 0.6 * (np.asarray(bad["slanted.stl"].vertices)[:, 2])
-    for name, mesh in bad.items():
-        write(folder / name, mesh)
-    obj = export_obj(box())
-    (folder / "nan.obj").write_text(obj.replace("v ", "v nan 0 0\nv ", 1).replace("f 1", "f 9", 1))
-    (folder / "empty.ply").write_bytes(b"")
-    (folder / "points.obj").write_text("v 0 0 0\nv 0 0 0.2\nv 0.1 0 0\n")
-    (folder / "sheet.obj").write_text("v 0 0 0\nv 0.1 0.1 0\nv 0.05 0.05 0.2\nf 1 2 3\n")
-    (folder / "noise.stl").write_bytes(bytes(range(256)) * 4)
-    (folder / "folder.obj").mkdir()
-    outside = tmp_path_factory.mktemp("outside") / "x.stl"
-    write(outside, box())
-    (folder / "link.stl").symlink_to(outside)
-    (folder / "dangling.stl").symlink_to(folder / "nothing.stl")
+    write(folder / "flat.stl", box(0.05, 0.004, 0.15))
+    write(folder / "tiny.stl", box(6e-5, 7e-5, 15e-5))
     (folder / "notes.txt").write_text("not a mesh")
     (folder / "objects.yaml").write_text(
         "defaults: {density: 400, friction: 0.3}\n"
         "a_box.stl: {mass: 0.33}\n"
         "c_millimetres.obj: {scale: 0.001, up: y}\n"
         "gone.stl: {mass: 0.1}\n"
-        "../outside/x.stl: {mass: 0.1}\n"
     )
     calls: list[tuple[int, int, str]] = []
     with pytest.MonkeyPatch.context() as patch:
@@ -97,40 +74,12 @@ def mixed(tmp_path_factory):
     return bank, {r.name: r.reason for r in refusals}, calls
 
 
-REASONS = {
-    "flat.stl": "flat: 50 x 4 x 150 mm; allowed is at least 10 mm",
-    "huge.stl": "wrong unit: 6e+04 x 7e+04 x 1.5e+05 mm, allowed are 0.01 to 1 m; set scale: 0.001",
-    "low.stl": "too low: 60 x 60 x 90 mm, up is z; allowed heights are 0.11 to 0.3 m",
-    "slanted.stl": "does not stand: tips over at",
-    "tall.stl": "too tall: 80 x 80 x 310 mm",
-    "tiny.stl": "set scale: 1000 if the file is in kilometres",
-    "wide.stl": "too wide: 210 x 50 x 150 mm; allowed is a width up to 0.2 m",
-    "nan.obj": "vertices are NaN or infinite; allowed are finite",
-    "empty.ply": "not a readable .ply file",
-    "points.obj": "no faces",
-    "sheet.obj": "encloses no volume",
-    "noise.stl": "not a readable .stl file",
-    "folder.obj": "missing or not a file",
-    "link.stl": "link that leads out of the folder",
-    "dangling.stl": "missing or not a file",
-    "gone.stl": "listed in objects.yaml but missing",
-    "../outside/x.stl": "listed in objects.yaml but leads out of the folder",
-}
-
-
 def test_good_meshes_load_beside_bad_ones(mixed):
     bank, reasons, calls = mixed
     assert bank.names == ("a_box", "b_bottle", "c_millimetres", "d_scene", "e_twin.obj", "e_twin.stl")
-    assert set(reasons) == set(REASONS)
+    assert set(reasons) == {"flat.stl", "tiny.stl", "gone.stl"}
     assert [done for done, _, _ in calls] == sorted(done for done, _, _ in calls)
     assert calls[-1][:2] == (len(bank.names) + len(reasons),) * 2
-
-
-@pytest.mark.parametrize("name", REASONS)
-def test_every_refusal_says_what_is_wrong_and_what_is_allowed(mixed, name):
-    _, reasons, _ = mixed
-    assert REASONS[name] in reasons[name]
-    assert "\n" not in reasons[name]
 
 
 def test_settings_reach_the_objects(mixed):
@@ -184,12 +133,6 @@ def test_a_crashing_decomposition_costs_one_mesh(tmp_path, monkeypatch):
 
 
 def test_sets_and_folders(tmp_path):
-    with pytest.raises(ValueError, match="no such folder"):
-        load_object_dir(tmp_path / "absent", "seen")
-    with pytest.raises(ValueError, match="holds no mesh; allowed are"):
-        load_object_dir(tmp_path, "seen")
-    with pytest.raises(ValueError, match="has no 'unseen' set; allowed here are seen"):
-        load_object_dir(tmp_path, "unseen")
     with pytest.raises(ValueError, match="'train' is unknown; allowed are seen, unseen"):
         load_object_dir(tmp_path, "train")
     (tmp_path / "unseen").mkdir()
@@ -228,14 +171,12 @@ def test_a_density_overrides_a_default_mass(tmp_path):
     assert (listed["a.stl"].mass, listed["a.stl"].density) == (None, 700)
 
 
-def test_too_small_a_set_is_refused(tmp_path):
-    write(tmp_path / "one.stl", box())
-    write(tmp_path / "two.stl", box(0.06, 0.06, 0.05))
-    with (
-        pytest.warns(UserWarning, match=r"two\.stl refused: too low"),
-        pytest.raises(ValueError, match=r"1 usable 'seen' objects .* at least 5 objects and 1 target"),
-    ):
-        load_bank_for(tmp_path, "seen")
+def test_what_is_refused_of_a_usable_set_is_a_warning(tmp_path):
+    for number in range(5):
+        write(tmp_path / f"{number}.stl", box(height=0.12 + 0.01 * number))
+    write(tmp_path / "low.stl", box(0.06, 0.06, 0.05))
+    with pytest.warns(UserWarning, match=r"low\.stl refused: too low"):
+        assert len(load_bank_for(tmp_path, "seen").names) == 5
     assert load_bank_for(None, "unseen").content_hash == builtin_bank("unseen").content_hash
 
 

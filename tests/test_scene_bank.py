@@ -100,6 +100,15 @@ def test_round_trip_and_cache(bank, scenes, tmp_path, monkeypatch):
     assert (loaded.split, loaded.tries, loaded.content_hash) == (built.split, built.tries, built.content_hash)
 
 
+def test_a_damaged_cache_is_packed_anew(bank, scenes, tmp_path, monkeypatch):
+    monkeypatch.setenv("PREGRASP_JAX_CACHE", str(tmp_path))
+    monkeypatch.setattr(scene_bank, "build", lambda *_, **__: scenes)
+    scene_bank.load_or_build(bank, CONFIG, "train")
+    (path,) = (tmp_path / "scenes").iterdir()
+    path.write_bytes(path.read_bytes()[:-100])
+    assert len(scene_bank.load_or_build(bank, CONFIG, "train")) == len(scene_bank.load(path)) == len(scenes)
+
+
 def test_foreign_and_broken_banks_are_refused(scenes, tmp_path):
     path = tmp_path / "bank.npz"
     scene_bank.save(path, scenes)

@@ -1,6 +1,5 @@
-"""`train.py`: what is wrong is one line and exit code 2; signals; the real thing killed and resumed (slow)."""
+"""`train.py`: help, how complaints are worded, signals; the real thing killed and resumed (slow)."""
 
-import importlib.util
 import json
 import os
 import signal
@@ -10,53 +9,12 @@ import time
 from pathlib import Path
 
 import pytest
+from scripts import load_script
 
-from pregrasp_jax.checkpoint import write_config
 from pregrasp_jax.command_line import unbox
-from pregrasp_jax.config import PRESETS
 
 ROOT = Path(__file__).parent.parent
-_spec = importlib.util.spec_from_file_location("train", ROOT / "train.py")
-assert _spec and _spec.loader
-train = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(train)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ("", "Expected one of {ci, demo, cpu, paper, resume}"),
-        ("foo", "Unrecognized options: foo (Available subcommands: ci, demo, cpu, paper, resume)"),
-        ("ci", "--run-dir PATH"),
-        ("ci --run-dir {tmp}/new --physics.enginee mjx", "--physics.enginee, mjx (--physics.engine {native,mjx,warp})"),
-        ("ci --run-dir {tmp}/new --physics.engine bullet", "Expected one of ('native', 'mjx', 'warp')"),
-        ("ci --run-dir {tmp}/new --seed 1.5", "Error parsing --seed"),
-        ("ci --run-dir {tmp}/new --replay.hindsight maybe", "'maybe'"),
-        ("ci --run-dir {tmp}/new --no-replay.hindsight", "Unrecognized options: --no-replay.hindsight"),
-        ("ci --run-dir {tmp}/new --task.r-in 3", "task.r_in = 3.0 is out of range; allowed is 0.005 to 0.5"),
-        ("ci --run-dir {tmp}/full", "is not empty and holds no run; allowed is a new or empty folder"),
-        ("ci --run-dir {tmp}/run", "already holds a run; continue it with `python train.py resume"),
-        ("ci --run-dir {tmp}/new --init-from {tmp}/nothing", "nothing does not exist; allowed: a run folder"),
-        ("ci --run-dir {tmp}/new --assets.object-dir {tmp}/nothing", "nothing: no such folder"),
-        ("resume {tmp}/nothing", "is not a run folder"),
-        ("resume {tmp}/typo", "unknown config key sead"),
-        ("resume {tmp}/run --seed 4", "changed configuration (seed: 0 -> 4); allowed to change: train.minutes"),
-    ],
-)
-def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, capsys, arguments, said):
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "thesis.tex").write_text("")
-    write_config(tmp_path / "run" / "config.yaml", PRESETS["ci"])
-    (tmp_path / "typo").mkdir()
-    (tmp_path / "typo" / "config.yaml").write_text("sead: 1\n")
-    before = sorted(tmp_path.rglob("*"))
-    monkeypatch.setattr(sys, "argv", ["train.py", *arguments.format(tmp=tmp_path).split()])
-    with pytest.raises(SystemExit) as exit_info:
-        train.main()
-    error = capsys.readouterr().err
-    assert exit_info.value.code == 2
-    assert error.startswith("error: ") and error.count("\n") == 1 and said in error
-    assert sorted(tmp_path.rglob("*")) == before
+train = load_script("train")
 
 
 def test_help_shows_the_defaults_of_the_preset(monkeypatch, capsys):

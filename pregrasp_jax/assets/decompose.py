@@ -121,7 +121,7 @@ def _solid_parts(parts: list[np.ndarray]) -> tuple[np.ndarray, ...]:
     """Drop slivers, simplify the rest to the full topology, and put the largest first."""
     volumes = np.array([volume(part) for part in parts])
     if not volumes.any():
-        raise ValueError("the mesh encloses no volume")
+        raise ValueError("encloses no volume; allowed is the surface of a solid")
     # Rounded, because which of two equal parts has the larger last bits depends on the processor.
     order = np.argsort(-np.round(volumes / volumes.sum(), 6), kind="stable")
     keep = [i for i in order if volumes[i] > _MIN_PART * volumes.sum()]

@@ -28,14 +28,16 @@ def load_bank_for(object_dir: str | Path | None, object_set: str, *, progress: P
     if object_dir is None:
         return builtin_bank(object_set)
     bank, refusals = load_object_dir(Path(object_dir), object_set, progress=progress)
-    for refusal in refusals:
-        warnings.warn(f"{object_dir}: {refusal.name} refused: {refusal.reason}", stacklevel=2)
     targets = int(np.sum(bank.eligible))
     if len(bank.names) < MIN_OBJECTS or targets == 0:
+        first = f", the first: {refusals[0].name}: {refusals[0].reason}" if refusals else ""
         raise ValueError(
-            f"{object_dir}: {len(bank.names)} usable '{object_set}' objects of which {targets} can be targets "
-            f"({len(refusals)} refused); allowed are at least {MIN_OBJECTS} objects and 1 target"
+            f"{object_dir}: {len(bank.names)} usable '{object_set}' objects of which {targets} can be targets; allowed "
+            f"are at least {MIN_OBJECTS} objects and 1 target. {len(refusals)} were refused{first}; "
+            f"`python -m pregrasp_jax assets {object_dir}` lists all"
         )
+    for refusal in refusals:
+        warnings.warn(f"{object_dir}: {refusal.name} refused: {refusal.reason}", stacklevel=2)
     return bank
 
 

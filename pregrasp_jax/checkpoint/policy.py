@@ -25,6 +25,7 @@ PARAMS_PREFIX = "learning/learner/target_params/"
 """Where a training state keeps what a policy needs."""
 
 _PARAMS = "params.safetensors"
+_ALLOWED = f"a run folder of train.py, or a folder with the {_PARAMS} that it wrote"
 
 
 @dataclass(frozen=True)
@@ -67,12 +68,15 @@ def load_policy(path: Path | str) -> Policy:
     path = Path(path)
     for candidate in (path, path / _PARAMS, path / "best" / _PARAMS):
         if candidate.is_file():
-            return _read_policy(candidate)
+            try:
+                return _read_policy(candidate)
+            except ValueError as error:
+                raise type(error)(f"{error}; allowed: {_ALLOWED}") from None
     config_file = path / "config.yaml"
     if config_file.is_file() and (path / "checkpoints").is_dir():
         return _policy_of_checkpoint(path / "checkpoints", read_config(config_file))
     problem = "is neither a run folder nor a policy folder" if path.is_dir() else "does not exist"
-    raise ValueError(f"policy {path} {problem}; allowed: a run folder of train.py, or a folder with {_PARAMS}")
+    raise ValueError(f"policy {path} {problem}; allowed: {_ALLOWED}")
 
 
 def write_config(path: Path, config: Config) -> None:
@@ -101,6 +105,8 @@ def _read_policy(path: Path) -> Policy:
         evaluation, expected = json.loads(metadata["evaluation"]), metadata["checksum"]
     except (KeyError, json.JSONDecodeError):
         raise ValueError(f"{path} was not written by this package: its header names no config") from None
+    except ValueError as error:
+        raise ValueError(f"{path} was written by another version of this package: {error}") from None
     params = trees.nest(arrays)
     if trees.checksum(params) != expected:
         raise DamagedFileError(f"{path} is altered (checksum differs)")

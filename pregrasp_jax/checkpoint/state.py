@@ -66,26 +66,35 @@ def save(folder: Path, step: int, tree: Any, ring: Ring, extra: dict[str, Any]) 
 
     Returns:
         The folder of the checkpoint.
+
+    Raises:
+        OSError: the disk is full; nothing of this checkpoint is left.
     """
     target = folder / f"{step:09d}"
-    # An unfinished or outdated checkpoint of the same step must not gain a manifest that does not match it.
-    (target / _MANIFEST).unlink(missing_ok=True)
     known = {chunk for path in _newest_first(folder) for chunk in _listed_chunks(path)}
-    current = chunks.append(folder / _REPLAY, ring, sorted(known))
-    state = trees.encode(trees.named_leaves(tree))
-    io.write_bytes(target / _STATE, state)
-    manifest = {
-        "format": FORMAT,
-        "step": step,
-        "state_sha256": hashlib.sha256(state).hexdigest(),
-        "state_checksum": trees.checksum(tree),
-        "observations": ring.written,
-        "chunks": [list(chunk) for chunk in current],
-        "extra": extra,
-    }
-    io.write_json(target / _MANIFEST, {"checksum": io.content_hash(manifest), **manifest})
-    _prune(folder)
+    try:
+        current = chunks.append(folder / _REPLAY, ring, sorted(known))
+        state = trees.encode(trees.named_leaves(tree))
+        # A checkpoint of the same step stays valid meanwhile: the state of a step is always the same.
+        io.write_bytes(target / _STATE, state)
+        manifest = {
+            "format": FORMAT,
+            "step": step,
+            "state_sha256": hashlib.sha256(state).hexdigest(),
+            "state_checksum": trees.checksum(tree),
+            "observations": ring.written,
+            "chunks": [list(chunk) for chunk in current],
+            "extra": extra,
+        }
+        io.write_json(target / _MANIFEST, {"checksum": io.content_hash(manifest), **manifest})
+    finally:  # also after a failure, so that a full disk does not fill further with halves
+        _prune(folder)
     return target
+
+
+def exists(folder: Path) -> bool:
+    """Return whether a checkpoint was ever completed in a folder."""
+    return any(_newest_first(folder))
 
 
 def restore(folder: Path, template: Any, ring_template: Any) -> Restored:
@@ -109,13 +118,15 @@ def restore(folder: Path, template: Any, ring_template: Any) -> Restored:
         except DamagedFileError as error:
             damaged[path] = str(error)
             continue
+        except ValueError as error:
+            raise ValueError(f"{error}; allowed is a checkpoint of the same configuration and version") from None
         for broken in damaged:
             _set_aside(broken)
         return Restored(manifest["step"], tree, ring, manifest["extra"], tuple(damaged.values()))
     if damaged:
         raise ValueError(
-            f"{folder}: none of {len(damaged)} checkpoints is intact; newest: {next(iter(damaged.values()))}; "
-            "--init-from starts a new run from its best policy"
+            f"{folder}: none of {len(damaged)} checkpoints is intact; newest: {next(iter(damaged.values()))}; allowed "
+            "is a run with one that is; --init-from starts a new run from its best policy"
         )
     raise ValueError(f"{folder} holds no checkpoint")
 

@@ -116,6 +116,8 @@ def show(
         png: the picture.
     """
     refuse_unwritable(png)
+    if pushes < 0:
+        raise ValueError(f"pushes = {pushes} is out of range; allowed is 0 and more")
     assets_config = AssetsConfig(object_dir=object_dir, object_set=object_set)
     player = make_player(EvaluationConfig(policy=policy, assets=assets_config, camera=camera))
     if not 0 <= scene < len(player.env.scenes):

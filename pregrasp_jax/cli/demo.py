@@ -21,6 +21,8 @@ def demo(*, run_dir: Path = Path("runs/demo"), minutes: float = 5.0, episodes: i
         minutes: of training; enough to see every part work, not to learn the task.
         episodes: test scenes for each policy.
     """
+    if episodes < 1:
+        raise ValueError(f"episodes = {episodes} is out of range; allowed is 1 and more")
     preset = PRESETS["demo"]
     config = dataclasses.replace(preset, train=dataclasses.replace(preset.train, minutes=minutes)).validate()
     begun = (run_dir / "config.yaml").exists()

@@ -1,6 +1,5 @@
 """The command `evaluate.py`: run, print the table, write the JSON and the film."""
 
-import os
 from pathlib import Path
 
 from pregrasp_jax import io
@@ -48,7 +47,5 @@ def refuse_unwritable(path: Path | None) -> None:
     if path is None:
         return
     if path.is_dir():
-        raise ValueError(f"{path} is a folder; wanted the name of a file")
-    folder = next(parent for parent in path.absolute().parents if parent.exists())
-    if not (folder.is_dir() and os.access(folder, os.W_OK)):
-        raise ValueError(f"{path} cannot be written: {folder} is not a writable folder")
+        raise ValueError(f"{path} is a folder; allowed is the name of a file")
+    io.refuse_unwritable(path)

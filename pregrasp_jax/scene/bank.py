@@ -79,7 +79,8 @@ def load_or_build(
     """Return the split's scenes from the cache, or pack them and store them there.
 
     Raises:
-        ValueError: the object set cannot be packed (too few objects accepted or no eligible target).
+        ValueError: the object set cannot be packed (too few objects accepted or no eligible target), or there is
+            no place to store the scenes.
     """
     digest = bank_hash(bank, config, split)
     path = io.cache_dir() / "scenes" / f"{split}-{digest}.npz"
@@ -88,6 +89,7 @@ def load_or_build(
             return load(path, digest)
         except ValueError:
             path.unlink()
+    io.refuse_unwritable(path)
     scenes = build(bank, config, split, threads=threads, progress=progress)
     save(path, scenes)
     return scenes

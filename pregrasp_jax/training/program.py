@@ -143,7 +143,7 @@ def make_program(
     )
     if params is not None and not q.fits(params):
         raise ValueError(
-            f"the initial parameters are of another network; this run has network.architecture = "
+            f"the initial parameters (--init-from) are of another network; allowed is network.architecture = "
             f"{config.network.architecture} and network.width = {config.network.width}"
         )
     return Program(init, collect, make_remember(config.replay), update)

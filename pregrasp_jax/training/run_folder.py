@@ -4,6 +4,7 @@ runs/NAME/: config.yaml, manifest.json, metrics.jsonl, tensorboard/ (if asked fo
 """
 
 import datetime
+import errno
 import fcntl
 import json
 import os
@@ -15,6 +16,7 @@ import jax
 
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint.policy import read_config, write_config
+from pregrasp_jax.checkpoint.state import exists
 from pregrasp_jax.config import Config, difference
 from pregrasp_jax.machine import versions
 from pregrasp_jax.training.event_log import EventLog
@@ -40,7 +42,7 @@ class RunFolder:
     @property
     def has_checkpoint(self) -> bool:
         """Whether the run got as far as its first checkpoint."""
-        return self.checkpoints.is_dir() and any(self.checkpoints.iterdir())
+        return exists(self.checkpoints)
 
     @property
     def best(self) -> Path:
@@ -77,6 +79,7 @@ class RunFolder:
                 f"{', '.join(EXTENDABLE)}; --init-from starts a new run from its parameters"
             )
         folder = cls(path, _locked(path))
+        io.sweep(path)
         if changed:
             write_config(path / "config.yaml", config)
         return folder
@@ -93,10 +96,10 @@ class RunFolder:
         """Record versions, machine and hashes; call it before anything else is written.
 
         Raises:
-            ValueError: the run began with other objects or scenes.
+            ValueError: the run began with other objects or scenes, or its manifest is damaged.
         """
         file = self.path / "manifest.json"
-        manifest = json.loads(file.read_text()) if file.exists() else {"hashes": hashes, "sessions": []}
+        manifest = _read_manifest(file) if file.exists() else {"hashes": hashes, "sessions": []}
         if manifest["hashes"] != hashes:
             odd = [name for name in hashes if manifest["hashes"].get(name) != hashes[name]]
             raise ValueError(
@@ -115,9 +118,17 @@ class RunFolder:
         self._event_log = EventLog(self.path / "tensorboard", resumed_at=resumed_at)
 
     def append_metrics(self, row: dict[str, Any]) -> None:
-        """Append one row to metrics.jsonl."""
-        with (self.path / "metrics.jsonl").open("a") as file:
-            file.write(json.dumps(row, allow_nan=False) + "\n")
+        """Append one row to metrics.jsonl, whole or not at all.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        data = (json.dumps(row, allow_nan=False) + "\n").encode()
+        with (self.path / "metrics.jsonl").open("ab", buffering=0) as file:
+            length = file.tell()
+            if file.write(data) < len(data):  # what a full disk does at first; only the next write raises
+                file.truncate(length)
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), file.name)
         if self._event_log:
             self._event_log.append(row)
 
@@ -125,7 +136,7 @@ class RunFolder:
         """Drop the rows later than a checkpoint, which will be measured again, and a last line that was cut."""
         file = self.path / "metrics.jsonl"
         if file.exists():
-            kept = [line for line in file.read_text().splitlines() if _env_steps(line) <= env_steps]
+            kept = [line for line in file.read_text(errors="replace").splitlines() if _env_steps(line) <= env_steps]
             io.write_bytes(file, "".join(f"{line}\n" for line in kept).encode())
 
 
@@ -133,7 +144,7 @@ def refuse_used(path: Path) -> None:
     """Refuse a folder in which no run can begin, before any work is done for it.
 
     Raises:
-        ValueError: it holds a run, or anything else.
+        ValueError: it holds a run, or anything else, or cannot be written.
     """
     if path.exists() and not path.is_dir():
         raise ValueError(f"run folder {path} is a file; allowed is a new or empty folder")
@@ -144,6 +155,7 @@ def refuse_used(path: Path) -> None:
         )
     if path.exists() and any(entry.name != "run.lock" for entry in path.iterdir()):
         raise ValueError(f"run folder {path} is not empty and holds no run; allowed is a new or empty folder")
+    io.refuse_unwritable(path / "config.yaml")
 
 
 def stored_config(path: Path) -> Config:
@@ -167,6 +179,17 @@ def describe_machine() -> dict[str, Any]:
         "cores": os.cpu_count(),
         "devices": [device.device_kind for device in jax.local_devices()],
     }
+
+
+def _read_manifest(file: Path) -> dict[str, Any]:
+    try:
+        manifest = json.loads(file.read_bytes())
+        return {"hashes": dict(manifest["hashes"]), "sessions": list(manifest["sessions"])}
+    except (ValueError, KeyError, TypeError):
+        raise ValueError(
+            f"{file} is damaged; it says which objects and scenes the run began with. Put a copy back, or delete it to "
+            "go on with those that the configuration names"
+        ) from None
 
 
 def _env_steps(line: str) -> float:

@@ -95,11 +95,17 @@ class Trainer:
         self._logged_at = (0, 0.0)
 
     def begin(self) -> None:
-        """Start from the seed, and write the checkpoint of step 0."""
+        """Start from the seed, and write the checkpoint of step 0.
+
+        Raises:
+            ValueError: it cannot be written, so no later one could.
+        """
         self.state = jax.jit(self.program.init)(jax.random.key(self.config.seed))
         if self.config.train.tensorboard:
             self.folder.begin_event_log()
         self.save()
+        if not self.saved:
+            raise ValueError(f"no checkpoint can be written to {self.folder.path}; allowed is a disk with room for it")
 
     def resume(self) -> None:
         """Continue from the newest intact checkpoint.
@@ -126,13 +132,14 @@ class Trainer:
         Returns:
             One line that says why it ended.
         """
-        if self.progress.share_done(self.config) >= 1.0:
+        progress = self.progress
+        if progress.share_done(self.config) >= 1.0 and progress.evaluated_at == progress.env_steps:
             return "the run is complete; a higher --train.episodes or --train.minutes extends it"
         self.console.say("compiling ...")
         program, seconds = self.program.compile(self.state)
         self.console.say(f"compiled in {seconds:.1f} s")
         self.console.start()
-        while self.progress.share_done(self.config) < 1.0:
+        while progress.share_done(self.config) < 1.0:
             if stop():
                 return self._interrupted()
             self._step(program)
@@ -140,11 +147,11 @@ class Trainer:
                 self.log()
             if self._crossed(self.config.train.evaluate_every):
                 self.evaluate()
-            if self.progress.total_seconds - self._tried_to_save_at >= 60 * self.config.train.checkpoint_minutes:
+            if progress.total_seconds - self._tried_to_save_at >= 60 * self.config.train.checkpoint_minutes:
                 self.save()
         self.evaluate()
         self.save()
-        return f"done: {self.progress.episodes} episodes in {format_time(self.progress.total_seconds)}"
+        return f"done: {progress.episodes} episodes in {format_time(progress.total_seconds)}"
 
     def _interrupted(self) -> str:
         self.save()
@@ -250,9 +257,10 @@ class Trainer:
         try:
             write()
         except OSError as error:
+            last = "there is none yet" if self._saved_at < 0 else f"the last checkpoint is of step {self._saved_at}"
             self.console.say(
                 f"warning: no {what} written at step {self.progress.env_steps} ({error.strerror}: {self.folder.path}); "
-                f"the last checkpoint is of step {self._saved_at}"
+                f"{last}"
             )
             return False
         return True

@@ -1,0 +1,139 @@
+"""A folder of files that nobody can use, and why not."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from fake_training import make_config
+from trimesh.exchange.obj import export_obj
+
+from pregrasp_jax.assets.mesh_file import MAX_BYTES
+from pregrasp_jax.checkpoint import Ring, save, save_policy, trees, write_config
+from pregrasp_jax.config import PRESETS
+
+FAKE_HASHES = {"hull bank": "hulls", "training scenes": "scenes", "validation scenes": "scenes"}
+"""Of the world without physics."""
+
+
+def make_bad_files(folder: Path) -> None:
+    """Write them all."""
+    (folder / "file").write_text("")
+    (folder / "full").mkdir()
+    (folder / "full" / "thesis.tex").write_text("")
+    make_bad_runs(folder)
+    make_bad_policies(folder)
+    make_bad_evaluations(folder)
+    for name, write in BAD_MESHES.items():
+        (folder / "meshes" / name).mkdir(parents=True)
+        write(folder / "meshes" / name)
+
+
+def make_bad_runs(folder: Path) -> None:
+    write_config(folder / "run" / "config.yaml", PRESETS["ci"])
+    (folder / "typo").mkdir()
+    (folder / "typo" / "config.yaml").write_text("sead: 1\n")
+    manifest = {"hashes": {"hull bank": "of yesterday"}, "sessions": []}
+    for name, text in {"other": json.dumps(manifest), "cut": json.dumps(manifest)[:9], "list": "[]"}.items():
+        write_config(folder / name / "config.yaml", make_config())
+        (folder / name / "manifest.json").write_text(text)
+    ring = Ring({"height": np.zeros((2, 2), np.uint8)}, 1)
+    for name in ("foreign", "damaged"):
+        write_config(folder / name / "config.yaml", make_config())
+        save(folder / name / "checkpoints", 7, {"colour": np.zeros(3)}, ring, {})
+        (folder / name / "manifest.json").write_text(json.dumps({"hashes": FAKE_HASHES, "sessions": []}))
+    flip_last_byte(folder / "damaged" / "checkpoints" / "000000007" / "state.safetensors")
+
+
+def make_bad_policies(folder: Path) -> None:
+    arrays, config = {"a": np.zeros(3, np.float32)}, '{"seed": 0, "colour": "red"}'
+    (folder / "noise").write_bytes(b"not a policy")
+    (folder / "foreign.safetensors").write_bytes(trees.encode(arrays))
+    newer = {"config": config, "evaluation": "{}", "checksum": trees.checksum(arrays)}
+    (folder / "newer.safetensors").write_bytes(trees.encode(arrays, newer))
+    for name in ("small", "altered"):
+        save_policy(folder / name, arrays, PRESETS["ci"], {})
+    flip_last_byte(folder / "altered" / "params.safetensors")
+
+
+def make_bad_evaluations(folder: Path) -> None:
+    document = {"format": "pregrasp_jax evaluation 1", "object_set": "seen", "hull_bank_hash": "h", "rows": []}
+    for name, scenes in (("a", "s"), ("b", "t")):
+        (folder / f"{name}.json").write_text(json.dumps(document | {"scene_bank_hash": scenes}))
+    (folder / "list.json").write_text("[]")
+
+
+def flip_last_byte(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+
+
+def box(*size: float) -> trimesh.Trimesh:
+    return trimesh.creation.box(size)
+
+
+def slanted() -> trimesh.Trimesh:
+    mesh = box(0.03, 0.03, 0.28)
+    mesh.vertices[:, 0] += 0.6 * np.asarray(mesh.vertices)[:, 2]
+    return mesh
+
+
+def link_outside(folder: Path) -> None:
+    box(0.06, 0.06, 0.15).export(folder.parent / "outside.stl")
+    (folder / "link.stl").symlink_to(folder.parent / "outside.stl")
+
+
+def name_outside(folder: Path) -> None:
+    (folder / "objects.yaml").write_text("../outside.stl: {mass: 0.1}\n")
+    (folder / "noise.stl").write_bytes(b"")
+
+
+def name_missing(folder: Path) -> None:
+    (folder / "objects.yaml").write_text("gone.stl: {mass: 0.1}\n")
+    (folder / "noise.stl").write_bytes(b"")
+
+
+def too_wide_for_targets(folder: Path) -> None:
+    for number in range(5):
+        box(0.12, 0.12, 0.15 + 0.01 * number).export(folder / f"{number}.stl")
+
+
+def too_many_bytes(folder: Path) -> None:
+    with (folder / "m.stl").open("wb") as file:
+        file.truncate(MAX_BYTES + 2**20)  # sparse: it takes no room
+
+
+def mesh(shape: trimesh.Trimesh) -> Any:
+    return lambda folder: shape.export(folder / "m.stl")
+
+
+def text(name: str, content: str) -> Any:
+    return lambda folder: (folder / name).write_text(content)
+
+
+BAD_MESHES = {
+    "nothing": lambda folder: None,
+    "flat": mesh(box(0.05, 0.004, 0.15)),
+    "millimetres": mesh(box(60, 70, 150)),
+    "kilometres": mesh(box(6e-5, 7e-5, 15e-5)),
+    "low": mesh(box(0.06, 0.06, 0.09)),
+    "tall": mesh(box(0.08, 0.08, 0.31)),
+    "wide": mesh(box(0.21, 0.05, 0.15)),
+    "slanted": mesh(slanted()),
+    "nan": text("m.obj", export_obj(box(0.06, 0.07, 0.15)).replace("v ", "v nan 0 0\nv ", 1).replace("f 1", "f 9", 1)),
+    "empty": text("m.ply", ""),
+    "points": text("m.obj", "v 0 0 0\nv 0 0 0.2\nv 0.1 0 0\n"),
+    "sheet": text("m.obj", "v 0 0 0\nv 0.1 0.1 0\nv 0.05 0.05 0.2\nf 1 2 3\n"),
+    "noise": lambda folder: (folder / "m.stl").write_bytes(bytes(range(256)) * 4),
+    "folder": lambda folder: (folder / "m.obj").mkdir(),
+    "link": link_outside,
+    "dangling": lambda folder: (folder / "m.stl").symlink_to(folder / "nothing.stl"),
+    "outside": name_outside,
+    "missing": name_missing,
+    "many_bytes": too_many_bytes,
+    "no_target": too_wide_for_targets,
+    "setting": text("objects.yaml", "m.stl: {colour: red}\n"),
+}
+"""What is wrong -> writes a folder of meshes of which that is true."""

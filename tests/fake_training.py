@@ -1,0 +1,128 @@
+"""Trainings in the world without physics, with a network that compiles in no time."""
+
+import dataclasses
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, TextIO
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from fake_env import FakeEnv
+
+from pregrasp_jax import grid
+from pregrasp_jax.config import PRESETS, Config, from_dict, to_dict
+from pregrasp_jax.learning.q_function import QFunction
+from pregrasp_jax.training import program
+from pregrasp_jax.training.console import Console
+from pregrasp_jax.training.run_folder import RunFolder
+from pregrasp_jax.training.trainer import Trainer
+from pregrasp_jax.types import MAX_OBJECTS, EnvState, Observation, StepResult
+
+TIME = "time/"
+
+
+@dataclasses.dataclass(frozen=True)
+class PictureEnv(FakeEnv):
+    """The fake world with random resets, and pictures that say where everything is."""
+
+    bank: Any = dataclasses.field(
+        default_factory=lambda: SimpleNamespace(eligible=np.array([True, True, False]), content_hash="hulls")
+    )
+
+    def reset(self, key: jax.Array) -> EnvState:
+        return self._draw(self.reset_to(jax.random.randint(key, (), 0, len(self.scenes))))
+
+    def step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, StepResult]:
+        next_state, result = super().step(state, action)
+        return self._draw(next_state), result
+
+    def _draw(self, state: EnvState) -> EnvState:
+        points = jnp.concatenate([state.centroids, state.p1[None]])
+        row, col = grid.world_to_cell(points)
+        ids = jnp.arange(1, MAX_OBJECTS + 2).astype(jnp.uint8)
+        blank = jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8)
+        height, instance_ids = (blank.at[row, col].set(x, mode="drop") for x in (100 + ids, ids))
+        return state.replace(obs=Observation(height, instance_ids, state.p1))
+
+
+def make_config(**train: Any) -> Config:
+    values = to_dict(PRESETS["ci"])
+    values["train"] |= {"num_envs": 3, "minutes": 0.0, "episodes": 12, "log_every": 6} | train
+    values["learner"] |= {"warmup": 9, "updates_per_step": 0.25, "batch_size": 2}
+    values["replay"] |= {"capacity": 70}
+    values["network"]["width"] = 1.0
+    return from_dict(values).validate()
+
+
+def input_fn(obs: Observation, target: jax.Array) -> jax.Array:
+    target_pixel = (obs.instance_ids == target + 1).astype(jnp.float32)
+    return jnp.stack([obs.height.astype(jnp.float32) / 255, target_pixel], axis=-1)
+
+
+class TinyNetwork(nn.Module):
+    """One convolution: compiles in no time."""
+
+    width: float = 1.0
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        return nn.Conv(2, (round(3 * self.width),) * 2, name="conv")(x)
+
+    def q_of_action(self, x: jax.Array, action: jax.Array) -> jax.Array:
+        return jnp.take_along_axis(self(x).reshape(x.shape[0], -1), action[:, None], axis=1)[:, 0]
+
+
+def make_program(config: Config, env: Any = None, **options: Any) -> program.Program:
+    q_function = QFunction(TinyNetwork(width=config.network.width), input_fn)
+    return program.make_program(env or PictureEnv(), config, q_function=q_function, **options)
+
+
+def evaluate(params: Any) -> dict[str, Any]:
+    return {"success_rate": 0.25, "mean_motions": None}
+
+
+def stop_after(steps: int) -> Callable[[], bool]:
+    """Stand for a signal that comes after a number of steps."""
+    left = iter(range(steps))
+    return lambda: next(left, None) is None
+
+
+def never() -> bool:
+    return False
+
+
+def make_trainer(
+    path: Path,
+    config: Config,
+    *,
+    resume: bool = False,
+    begin: bool = True,
+    said: TextIO | None = None,
+    env: Any = None,
+) -> Trainer:
+    built = make_program(config, env)
+    folder = RunFolder.open(path, config) if resume else RunFolder.create(path, config)
+    trainer = Trainer(config, folder, built, evaluate, Console(said or io.StringIO()))
+    if begin:
+        (trainer.resume if folder.has_checkpoint else trainer.begin)()
+    return trainer
+
+
+def run(path: Path, config: Config, *, stop: Callable[[], bool] = never, **options: Any) -> Trainer:
+    trainer = make_trainer(path, config, **options)
+    with trainer.folder:
+        trainer.run(stop)
+    return trainer
+
+
+def rows(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+
+
+def timeless(path: Path) -> list[dict[str, Any]]:
+    return [{k: v for k, v in row.items() if not k.startswith(TIME)} for row in rows(path)]
