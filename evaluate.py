@@ -37,6 +37,8 @@ class Arguments:
     """What the policy sees through; None is the camera it was trained with (orthographic for scripts)."""
     r_out: float | None = None
     """m, outer radius of the half ring; None is the one it was trained with."""
+    obstacles_may_leave: bool = False
+    """True counts failures as the paper does: an obstacle may leave the workspace, and stands beside it then."""
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     episodes: int = 100
@@ -64,6 +66,7 @@ def main() -> None:
             physics=arguments.physics,
             camera=arguments.camera,
             r_out=arguments.r_out,
+            obstacles_may_leave=arguments.obstacles_may_leave,
             episodes=arguments.episodes,
             seed=arguments.seed,
             num_envs=arguments.num_envs,

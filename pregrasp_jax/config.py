@@ -58,6 +58,9 @@ class TaskConfig:
     """Allow backward pushes too: the paper's Full-Ring ablation."""
     max_pushes: int = 10
     """Pushes before an episode is truncated (Sec. IV-A)."""
+    obstacles_may_leave: bool = False
+    """Only the target ends an episode by leaving the workspace: how the paper counts failures (Sec. IV-A). False lets
+    every object end it: how the paper trains (Sec. III-D), and stricter."""
     push_speed: float = 0.1
     """m/s, mean speed of the minimum-jerk push."""
     camera: Camera = "orthographic"

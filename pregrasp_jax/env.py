@@ -115,7 +115,9 @@ class Env:
             )
         )
         outcome = self._outcome(state, next_state, plan.reachable)
-        reward, terminated, reason = judge(outcome, state.scene.target)
+        reward, terminated, reason = judge(
+            outcome, state.scene.target, obstacles_may_leave=self.task.obstacles_may_leave
+        )
         truncated = ~terminated & (next_state.num_pushes >= self.task.max_pushes)
         reason = jnp.where(truncated, REASONS.index("truncated"), reason)
         return next_state, StepResult(outcome, reward, terminated, truncated, reason)
@@ -189,7 +191,7 @@ class Env:
             distance_before=_distance(before),
             distance_after=_distance(after),
             toppled=present & (up_z < jnp.cos(TOPPLED)),
-            off_table=jnp.any(present & (beyond | (com_z < 0))),
+            off_table=present & (beyond | (com_z < 0)),
             unreachable=~reachable | (end_error > MAX_END_ERROR),
             no_action=~jnp.any(self.action_mask(after.p1)),
             diverged=after.physics_obs.diverged,

@@ -31,7 +31,7 @@ def in_region(outcome: Outcome) -> jax.Array:
     return outcome.coverage > IN_REGION_COVERAGE
 
 
-def end_reason(outcome: Outcome, goal: jax.Array) -> jax.Array:
+def end_reason(outcome: Outcome, goal: jax.Array, *, obstacles_may_leave: bool = False) -> jax.Array:
     """Return why the push ends an episode whose target is `goal`, index into `REASONS`; `RUNNING` if it does not.
 
     The first match in the order of `REASONS` wins. Truncation is not a property of a push and is left to the caller.
@@ -39,13 +39,15 @@ def end_reason(outcome: Outcome, goal: jax.Array) -> jax.Array:
     Args:
         outcome: what the push did, unbatched; coverage is 0 while the hand is closed (there is no region then).
         goal: () int32 slot.
+        obstacles_may_leave: only the goal ends the episode by leaving the workspace (Sec. IV-A, how the paper counts);
+            else every object does (Sec. III-D, how it trains).
     """
     enclosed = in_region(outcome)
     is_goal = jnp.arange(enclosed.shape[0]) == goal
     holds = {
         "nan": outcome.diverged,
         "unreachable": outcome.unreachable,
-        "off_table": outcome.off_table,
+        "off_table": jnp.any(outcome.off_table & is_goal if obstacles_may_leave else outcome.off_table),
         "target_toppled": jnp.any(outcome.toppled & is_goal),
         "target_in_region": jnp.any(enclosed & is_goal),
         "obstacle_in_region": jnp.any(enclosed & ~is_goal),
@@ -74,16 +76,19 @@ def reward_terms(outcome: Outcome, goal: jax.Array, reason: jax.Array) -> dict[s
     }
 
 
-def judge(outcome: Outcome, goal: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def judge(
+    outcome: Outcome, goal: jax.Array, *, obstacles_may_leave: bool = False
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Judge one push for one goal.
 
     Args:
         outcome: what the push did, unbatched; coverage is 0 while the hand is closed.
         goal: () int32 slot of the object that is wanted.
+        obstacles_may_leave: see `end_reason`.
 
     Returns:
         reward () float32, terminated () bool, reason () int32 index into `REASONS` (`RUNNING` if not terminated).
     """
-    reason = end_reason(outcome, goal)
+    reason = end_reason(outcome, goal, obstacles_may_leave=obstacles_may_leave)
     reward = sum(reward_terms(outcome, goal, reason).values(), jnp.float32(0.0))
     return reward, reason != RUNNING, reason

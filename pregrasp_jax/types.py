@@ -148,7 +148,7 @@ class Outcome(struct.PyTreeNode):
         distance_before: [MAX_OBJECTS] float32 m, planar distance centroid to grasp point before the push.
         distance_after: [MAX_OBJECTS] float32 m, the same after it.
         toppled: [MAX_OBJECTS] bool, tilted more than 0.7 rad after the push.
-        off_table: () bool, some object left the workspace.
+        off_table: [MAX_OBJECTS] bool, outside the workspace or below the table after the push.
         unreachable: () bool, the push could not be executed, or ended more than 10 mm away.
         no_action: () bool, the half ring after the push holds no cell.
         diverged: () bool, the physics returned NaN.

@@ -96,7 +96,7 @@ class FakeEnv:
             distance_before=jnp.linalg.norm(state.centroids - state.p1[None], axis=-1),
             distance_after=distance,
             toppled=jnp.zeros(MAX_OBJECTS, bool),
-            off_table=jnp.zeros((), bool),
+            off_table=jnp.zeros(MAX_OBJECTS, bool),
             unreachable=~reachable,
             no_action=~jnp.any(self.action_mask(p1)),
             diverged=jnp.zeros((), bool),

@@ -183,16 +183,18 @@ def test_what_is_measured_agrees_with_mujoco_and_numpy(env, pushes, name):
             mujoco.mju_rotVecQuat(
                 centroid, np.asarray(env.bank.com[state.scene.object_ids[slot]], np.float64), seen[3:]
             )
-            centroids.append((centroid + seen[:3])[:2])
-            np.testing.assert_allclose(state.centroids[slot], centroids[-1], atol=1e-6)
+            centroids.append(centroid + seen[:3])
+            np.testing.assert_allclose(state.centroids[slot], centroids[-1][:2], atol=1e-6)
             mujoco.mju_quat2Mat(up, seen[3:])
+        start, (*end_xy, end_z) = centroids[0][:2], centroids[1]
+        assert outcome.off_table[slot] == (np.abs(end_xy).max() > 0.25 or end_z < 0)
         assert outcome.toppled[slot] == (np.arccos(min(up[8], 1.0)) > 0.7)
-        np.testing.assert_allclose(outcome.distance_before[slot], np.linalg.norm(centroids[0] - START), atol=1e-5)
+        np.testing.assert_allclose(outcome.distance_before[slot], np.linalg.norm(start - START), atol=1e-5)
         row, col, _ = CASES[name].action
         end = START if "too long" in name else np.array([-0.25 + 0.005 * (col + 0.5), -0.25 + 0.005 * (row + 0.5)])
-        np.testing.assert_allclose(outcome.distance_after[slot], np.linalg.norm(centroids[1] - end), atol=3e-4)
+        np.testing.assert_allclose(outcome.distance_after[slot], np.linalg.norm(np.subtract(end_xy, end)), atol=3e-4)
     empty = np.delete(np.arange(MAX_OBJECTS), [TARGET, OBSTACLE])
-    assert not outcome.toppled[empty].any() and not outcome.coverage[empty].any()
+    assert not outcome.toppled[empty].any() and not outcome.off_table[empty].any() and not outcome.coverage[empty].any()
 
 
 def test_a_push_moves_hand_and_fingers_to_where_it_was_told(pushes):
@@ -216,9 +218,9 @@ def test_an_unreachable_push_changes_nothing(pushes):
     before, after = pushes.before["too long"], pushes.after["too long"]
     jax.tree.map(np.testing.assert_array_equal, before, after)
     outcome = pushes.result["too long"].outcome
-    assert outcome.unreachable and not outcome.off_table
+    assert outcome.unreachable and not outcome.off_table.any()
     np.testing.assert_array_equal(outcome.distance_before, outcome.distance_after)
-    assert pushes.result["too long, and below the table"].outcome.off_table
+    assert pushes.result["too long, and below the table"].outcome.off_table.any()
 
 
 def test_a_diverged_scene_harms_no_other(pushes):
@@ -357,9 +359,11 @@ OTHER_CASES = {
     "success on the last push": Case(CAN_AT_PALM, BLOCK, reason="target_in_region", reward=2.0),
     "too long": Case(BOTTLE, BLOCK, (50, 99, CLOSED), "unreachable"),
     "nowhere to go": Case(BOTTLE, BLOCK, (50, 89, OPEN), "no_action"),
+    "an obstacle beyond the edge": Case(BOTTLE, ("ycb_wood_block", pose(0.26, 0.1)), reason="truncated", reward=0.5),
+    "the target beyond the edge": Case(("ycb_mustard_bottle", pose(0.1, -0.26)), BLOCK, reason="off_table"),
     "stopped": Case(("ycb_master_chef_can", pose(START[0] + PALM + 0.053, 0.0)), BLOCK, reason="unreachable"),
 }
-"""One push only, a ring of 0.3 to 0.5 m, a pinhole camera, and coffee cans of 4 tonnes."""
+"""One push only, a ring of 0.3 to 0.5 m, a pinhole camera, coffee cans of 4 tonnes, and obstacles may leave."""
 
 
 @pytest.fixture(scope="module")
@@ -367,7 +371,9 @@ def other(env) -> Pushes:
     heavy = np.where(np.array(NAMES) == "ycb_master_chef_can", 1e4, 1.0).astype(np.float32)
     bank = env.bank.replace(mass=env.bank.mass * heavy, inertia=env.bank.inertia * heavy[:, None])
     env = dataclasses.replace(env, bank=bank, engine=make_engine("native", bank))
-    return push_all(with_task(env, camera="pinhole", max_pushes=1, r_in=0.3, r_out=0.5), OTHER_CASES)
+    return push_all(
+        with_task(env, camera="pinhole", max_pushes=1, r_in=0.3, r_out=0.5, obstacles_may_leave=True), OTHER_CASES
+    )
 
 
 @pytest.mark.parametrize("name", OTHER_CASES)
@@ -375,7 +381,7 @@ def test_how_a_push_ends_under_another_task(other, name):
     result, case = other.result[name], OTHER_CASES[name]
     assert REASONS[result.reason] == case.reason
     assert result.reward == case.reward
-    assert result.truncated == (name == "truncated") and result.terminated == (name != "truncated")
+    assert result.truncated == (case.reason == "truncated") and result.terminated != result.truncated
     assert other.after[name].num_pushes == (name != "too long")
 
 

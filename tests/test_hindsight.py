@@ -25,7 +25,8 @@ def random_outcome(rng: np.random.Generator, *, enclosed: int | None = None, top
         "distance_after": before + rng.uniform(-0.003, 0.003, MAX_OBJECTS).astype(np.float32),
         "toppled": np.isin(np.arange(MAX_OBJECTS), list(toppled)),
     }
-    flags = ("off_table", "unreachable", "no_action", "diverged")
+    fields["off_table"] = np.zeros(MAX_OBJECTS, bool)
+    flags = ("unreachable", "no_action", "diverged")
     return Outcome(**fields, **dict.fromkeys(flags, np.zeros((), bool)))  # pyright: ignore[reportArgumentType]
 
 
@@ -84,7 +85,7 @@ ELIGIBLE = np.ones(MAX_OBJECTS, bool)
         ({4: 0.96}, {}, np.arange(MAX_OBJECTS) != 4, None),
         ({4: 0.95}, {}, ELIGIBLE, None),
         ({4: 0.96, 1: 0.99}, {}, ELIGIBLE, None),
-        ({4: 0.96}, {"off_table": True}, ELIGIBLE, None),
+        ({4: 0.96}, {"off_table": np.arange(MAX_OBJECTS) == 6}, ELIGIBLE, None),
         ({4: 0.96}, {"no_action": True}, ELIGIBLE, 4),
     ],
     ids=["one", "two", "larger not eligible", "not eligible", "at the bound", "target too", "off table", "no action"],
@@ -97,6 +98,22 @@ def test_enclosed_obstacle(coverage, flags, eligible, expected):
     assert bool(found) == (expected is not None)
     if expected is not None:
         assert int(slot) == expected
+
+
+def test_a_bystander_that_left_spoils_no_hindsight_where_obstacles_may_leave():
+    fallen, enclosed, target = 6, 4, 1
+    result = random_outcome(np.random.default_rng(1), enclosed=enclosed)
+    result = result.replace(off_table=np.arange(MAX_OBJECTS) == fallen)
+    for may_fall in (False, True):
+        slot, found = hindsight.enclosed_obstacle(
+            result, jnp.int32(target), jnp.asarray(ELIGIBLE), obstacles_may_leave=may_fall
+        )
+        assert bool(found) == may_fall and int(slot) == enclosed
+        outcomes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], result)
+        reward, terminated, _ = hindsight.relabel(
+            outcomes, jnp.int32(1), jnp.int32(enclosed), obstacles_may_leave=may_fall
+        )
+        assert (float(reward[0]), bool(terminated[0])) == (2.0 if may_fall else 0.0, True)
 
 
 def image(number: int) -> Observation:

@@ -9,18 +9,23 @@ from pregrasp_jax.types import MAX_OBJECTS, REASONS, Outcome
 GOAL, OTHER = 2, 5
 
 
-def outcome(*, coverage=None, closer=0.0, toppled=None, **flags) -> Outcome:
+def only(slot) -> jax.Array:
+    return jnp.zeros(MAX_OBJECTS, bool).at[MAX_OBJECTS if slot is None else slot].set(True, mode="drop")
+
+
+def outcome(*, coverage=None, closer=0.0, toppled=None, off_table=None, **flags) -> Outcome:
     """A push that changed nothing but what is named; `closer` applies to the goal, decoys move the other way."""
     before = jnp.linspace(0.1, 0.3, MAX_OBJECTS)
     after = (before + 0.02).at[GOAL].set(before[GOAL] - closer)
-    names = ("off_table", "unreachable", "no_action", "diverged")
+    names = ("unreachable", "no_action", "diverged")
     return Outcome(
         coverage=jnp.zeros(MAX_OBJECTS)
         .at[jnp.array(list(coverage or {0: 0.0}))]
         .set(jnp.array(list((coverage or {0: 0.0}).values()))),
         distance_before=before,
         distance_after=after,
-        toppled=jnp.zeros(MAX_OBJECTS, bool).at[MAX_OBJECTS if toppled is None else toppled].set(True, mode="drop"),
+        toppled=only(toppled),
+        off_table=only(off_table),
         **{name: jnp.asarray(flags.get(name, False)) for name in names},
     )
 
@@ -45,10 +50,11 @@ CASES = {
         "target_toppled",
     ),
     "an obstacle toppled": (outcome(toppled=OTHER, closer=0.1), 0.5, "running"),
-    "off the table while in region": (outcome(coverage={GOAL: 0.99}, off_table=True), 0.0, "off_table"),
-    "unreachable before off the table": (outcome(unreachable=True, off_table=True), 0.0, "unreachable"),
+    "off the table while in region": (outcome(coverage={GOAL: 0.99}, off_table=GOAL), 0.0, "off_table"),
+    "an obstacle off the table": (outcome(coverage={GOAL: 0.99}, off_table=OTHER), 0.0, "off_table"),
+    "unreachable before off the table": (outcome(unreachable=True, off_table=OTHER), 0.0, "unreachable"),
     "nan before all": (
-        outcome(diverged=True, unreachable=True, off_table=True, toppled=GOAL, coverage={GOAL: 1.0}, no_action=True),
+        outcome(diverged=True, unreachable=True, off_table=GOAL, toppled=GOAL, coverage={GOAL: 1.0}, no_action=True),
         0.0,
         "nan",
     ),
@@ -68,6 +74,21 @@ def test_hand_cases(case, compiled):
     assert bool(got_terminated) == (reason != "running")
 
 
+@pytest.mark.parametrize(
+    ("what", "reward", "reason"),
+    [
+        ({"off_table": OTHER, "closer": 0.1}, 0.5, "running"),
+        ({"off_table": OTHER, "coverage": {GOAL: 0.99}}, 2.0, "target_in_region"),
+        ({"off_table": OTHER, "coverage": {OTHER: 0.99}}, 0.0, "obstacle_in_region"),
+        ({"off_table": GOAL, "coverage": {GOAL: 0.99}}, 0.0, "off_table"),
+    ],
+)
+def test_where_obstacles_may_leave_only_the_goal_must_stay(what, reward, reason):
+    got_reward, terminated, got_reason = judge(outcome(**what), jnp.int32(GOAL), obstacles_may_leave=True)
+    assert (float(got_reward), REASONS[int(got_reason)]) == (reward, reason)
+    assert bool(terminated) == (reason != "running")
+
+
 def test_the_same_push_is_judged_per_goal():
     result = outcome(coverage={OTHER: 0.97}, toppled=GOAL)
     rewards, _, reasons = jax.vmap(judge, in_axes=(None, 0))(result, jnp.arange(MAX_OBJECTS))
@@ -82,7 +103,8 @@ def test_first_match_is_the_order_of_reasons():
     rng = np.random.default_rng(0)
     compiled = jax.jit(end_reason)
     for _ in range(100):
-        flags = {name: bool(rng.random() < 0.3) for name in ("diverged", "unreachable", "off_table", "no_action")}
+        flags = {name: bool(rng.random() < 0.3) for name in ("diverged", "unreachable", "no_action")}
+        fallen = int(rng.integers(MAX_OBJECTS)) if rng.random() < 0.3 else None
         coverage = {int(slot): float(rng.choice([0.2, 0.96])) for slot in rng.permutation(MAX_OBJECTS)[:2]}
         toppled = int(rng.integers(MAX_OBJECTS))
         inside = {slot for slot, share in coverage.items() if share > 0.95}
@@ -91,7 +113,7 @@ def test_first_match_is_the_order_of_reasons():
             for name, holds in [
                 ("nan", flags["diverged"]),
                 ("unreachable", flags["unreachable"]),
-                ("off_table", flags["off_table"]),
+                ("off_table", fallen is not None),
                 ("target_toppled", toppled == GOAL),
                 ("target_in_region", GOAL in inside),
                 ("obstacle_in_region", bool(inside - {GOAL})),
@@ -100,7 +122,7 @@ def test_first_match_is_the_order_of_reasons():
             ]
             if holds
         )
-        result = outcome(coverage=coverage, toppled=toppled, **flags)
+        result = outcome(coverage=coverage, toppled=toppled, off_table=fallen, **flags)
         assert REASONS[int(compiled(result, jnp.int32(GOAL)))] == expected
 
 

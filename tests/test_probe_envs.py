@@ -52,7 +52,7 @@ def push(state, action, next_state, *, goal=0, enclosed=None, approach=(), trunc
         distance_before=jnp.full(MAX_OBJECTS, 0.2),
         distance_after=jnp.where(jnp.isin(slots, jnp.array([*approach, -1])), 0.1, 0.3),
         toppled=jnp.zeros(MAX_OBJECTS, bool),
-        off_table=no,
+        off_table=jnp.zeros(MAX_OBJECTS, bool),
         unreachable=no,
         no_action=no,
         diverged=no,

@@ -56,7 +56,7 @@ class World:
             distance_before=stack("obs", np.float32)[:, None] + jnp.arange(8.0)[None],
             distance_after=stack("next_obs", np.float32)[:, None] + jnp.arange(8.0)[None],
             toppled=jnp.zeros((NUM_ENVS, MAX_OBJECTS), bool),
-            off_table=zeros,
+            off_table=jnp.zeros((NUM_ENVS, MAX_OBJECTS), bool),
             unreachable=zeros,
             no_action=zeros,
             diverged=stack("diverged", bool),

@@ -42,6 +42,7 @@ class EvaluationConfig:
         physics: engine.
         camera: None takes the one the policy was trained with (`orthographic` for scripts).
         r_out: m, outer radius of the half ring; None takes the one the policy was trained with.
+        obstacles_may_leave: count as the paper does: only the target fails by leaving the workspace.
         episodes: test scenes to run, from the first.
         seed: of the policy's own randomness.
         num_envs: scenes side by side; 0 chooses. Results do not depend on it.
@@ -53,6 +54,7 @@ class EvaluationConfig:
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     camera: Camera | None = None
     r_out: float | None = None
+    obstacles_may_leave: bool = False
     episodes: int = 100
     seed: int = 0
     num_envs: int = 0
@@ -161,6 +163,7 @@ def _environment_config(request: EvaluationConfig, trained: Config) -> Config:
             trained.task,
             camera=request.camera or trained.task.camera,
             r_out=trained.task.r_out if request.r_out is None else request.r_out,
+            obstacles_may_leave=request.obstacles_may_leave,
         ),
     )
     return config.validate()

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from pregrasp_jax.config import LearnerConfig, ReplayConfig
+from pregrasp_jax.config import LearnerConfig, ReplayConfig, TaskConfig
 from pregrasp_jax.learning import hindsight, learner
 from pregrasp_jax.learning import replay as replay_lib
 from pregrasp_jax.learning.learner import ApplyFn, LearnerState, MaskFn, Params, QAtFn
@@ -82,13 +82,14 @@ def init_learning(
     )
 
 
-def make_remember(config: ReplayConfig) -> RememberFn:
+def make_remember(config: ReplayConfig, task: TaskConfig) -> RememberFn:
     """Return the function that adds one push of every scene to the memory, and hindsight rows where they are due."""
 
     def remember(state: Learning, experience: Experience) -> Learning:
         replay = replay_lib.add(state.replay, experience.steps)
         if config.hindsight:
-            replay = hindsight.add_hindsight(replay, experience.eligible)
+            rule = task.obstacles_may_leave
+            replay = hindsight.add_hindsight(replay, experience.eligible, obstacles_may_leave=rule)
         return state.replace(replay=replay)
 
     return remember

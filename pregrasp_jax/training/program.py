@@ -146,7 +146,7 @@ def make_program(
             f"the initial parameters (--init-from) are of another network; allowed is network.architecture = "
             f"{config.network.architecture} and network.width = {config.network.width}"
         )
-    return Program(init, collect, make_remember(config.replay), update)
+    return Program(init, collect, make_remember(config.replay, config.task), update)
 
 
 def enable_compilation_cache() -> None:
