@@ -33,11 +33,13 @@ class Limits:
     """Sizes fixed when the program is compiled.
 
     Attributes:
-        max_geom_pairs: pairs of each group (mesh-mesh, box-mesh, ...) that reach the narrow phase.
+        max_hull_pairs: pairs of hulls that reach the narrow phase, those whose boxes overlap most.
+        max_robot_pairs: the same for a hull and one of the robot's boxes, and for a hull and one of its capsules.
         max_contact_points: contacts that reach the solver, the deepest ones.
     """
 
-    max_geom_pairs: int
+    max_hull_pairs: int
+    max_robot_pairs: int
     max_contact_points: int
 
 
@@ -45,12 +47,14 @@ class ContactCounts(struct.PyTreeNode):
     """What the broadphase saw, before it dropped anything.
 
     Attributes:
-        pairs: () int32 overlapping boxes in the fullest culled group.
+        hull_pairs: () int32 pairs of hulls with overlapping boxes.
+        robot_pairs: () int32 the same for hulls and robot, in the fuller of its two groups.
         contacts: () int32 penetrating contacts.
         depth: () float32 m, deepest penetration.
     """
 
-    pairs: jax.Array
+    hull_pairs: jax.Array
+    robot_pairs: jax.Array
     contacts: jax.Array
     depth: jax.Array
 
@@ -71,23 +75,25 @@ def collide(
         The data with its contacts, and the counts to be compared with `limits`.
     """
     boxes = bounding_boxes(m, d, hulls, hull_ids)
-    parts, counts = [], []
+    parts, overlaps = [], {"hull": jnp.int32(0), "robot": jnp.int32(0)}
     for key, pairs in collision_driver._geom_groups(m).items():
         geom = jnp.array(pairs)[:, :2]
         gap = jnp.full(len(geom), -_FAR)
         if key.types[0] != GeomType.PLANE:
             gap = _gap(boxes, geom)
-            counts.append(jnp.sum(gap < 0))
-            if len(geom) > limits.max_geom_pairs:
-                gap, chosen = _smallest(gap, limits.max_geom_pairs)
-                geom = geom[chosen]
+            name = "hull" if key.types[0] == GeomType.MESH else "robot"
+            overlaps[name] = jnp.maximum(overlaps[name], jnp.sum(gap < 0))
+            limit = limits.max_hull_pairs if name == "hull" else limits.max_robot_pairs
+            gap, chosen = _smallest(gap, min(limit, len(geom)))
+            geom = geom[chosen]
         dist, pos, frame = _narrow_phase(m, d, key, geom, hulls, hull_ids)
         repeats = len(dist) // len(geom)
         present = (gap < 0) & ~_absent(m, hull_ids)[geom].any(axis=1)
         parts.append((jnp.where(jnp.repeat(present, repeats), dist, _NONE), pos, frame, jnp.repeat(geom, repeats, 0)))
     dist, pos, frame, geom = (jnp.concatenate(part) for part in zip(*parts, strict=True))
     count = ContactCounts(
-        pairs=jnp.max(jnp.stack(counts)).astype(jnp.int32),
+        hull_pairs=overlaps["hull"],
+        robot_pairs=overlaps["robot"],
         contacts=jnp.sum(dist < 0).astype(jnp.int32),
         depth=jnp.max(-dist, initial=0.0),
     )

@@ -23,8 +23,9 @@ from pregrasp_jax.robot.kinematics import grasp_pose
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, HullBank, PhysicsObservation, SceneParams
 
-LIMITS = Limits(max_geom_pairs=32, max_contact_points=64)
-"""Sizes of the broadphase for 8 slots of 6 hulls."""
+LIMITS = Limits(max_hull_pairs=32, max_robot_pairs=16, max_contact_points=64)
+"""Sizes for 8 slots of 6 hulls. Over 2513 states of pushes through 100 packed scenes of the seen set the 99.9th
+percentiles are 25 hull pairs, 11 robot pairs and 48 contacts (most seen: 25, 12 and 50)."""
 
 MAX_PENETRATION = 0.02
 """m; a scene in which two bodies overlap deeper than this has diverged."""
@@ -44,7 +45,8 @@ class MjxState(struct.PyTreeNode):
         diverged: () bool; the rest is then the last state before that.
         pair_overflows: () int32 physics steps since the reset in which overlapping pairs were dropped.
         contact_overflows: () int32 physics steps since the reset in which penetrating contacts were dropped.
-        max_pairs: () int32 most overlapping pairs of one group since the reset.
+        max_hull_pairs: () int32 most pairs of hulls with overlapping boxes since the reset.
+        max_robot_pairs: () int32 the same for hulls and robot.
         max_contacts: () int32 most penetrating contacts since the reset.
     """
 
@@ -55,7 +57,8 @@ class MjxState(struct.PyTreeNode):
     diverged: jax.Array
     pair_overflows: jax.Array
     contact_overflows: jax.Array
-    max_pairs: jax.Array
+    max_hull_pairs: jax.Array
+    max_robot_pairs: jax.Array
     max_contacts: jax.Array
 
 
@@ -93,7 +96,8 @@ def make_engine(
             diverged=no_slot | ~jnp.all(jnp.isfinite(scene.poses)),
             pair_overflows=zero,
             contact_overflows=zero,
-            max_pairs=zero,
+            max_hull_pairs=zero,
+            max_robot_pairs=zero,
             max_contacts=zero,
         )
 
@@ -133,7 +137,7 @@ def run_controls(
         d = template.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
         d = d.replace(ctrl=ctrl[row] + share * (following[row] - ctrl[row]))
         d, counts = step(m, d, model, hull_ids)
-        return k + 1, _guarded(model, state, d, counts)
+        return k + 1, guarded(model, state, d, counts)
 
     return jax.lax.while_loop(not_through, body, (jnp.int32(0), state))[1]
 
@@ -149,21 +153,24 @@ def step(m: mjx.Model, d: mjx.Data, model: MjxSlotModel, hull_ids: jax.Array) ->
     return d, counts
 
 
-def _guarded(model: MjxSlotModel, state: MjxState, d: mjx.Data, counts: ContactCounts) -> MjxState:
+def guarded(model: MjxSlotModel, state: MjxState, d: mjx.Data, counts: ContactCounts) -> MjxState:
     """Return the state after a physics step, or the one before, marked diverged, if the new one makes no sense."""
     finite = jnp.all(jnp.isfinite(d.qpos)) & jnp.all(jnp.isfinite(d.qvel))
     slow = jnp.max(jnp.abs(d.qvel)) < MAX_SPEED
     present = state.object_ids[: model.num_slots] >= 0
     above = jnp.all(~present | (d.qpos[model.qpos_ids[:, 2]] > -MAX_FALL))
     fine = finite & slow & above & (counts.depth < MAX_PENETRATION)
+    limits = model.limits
+    too_many_pairs = (counts.hull_pairs > limits.max_hull_pairs) | (counts.robot_pairs > limits.max_robot_pairs)
     keep = lambda new, old: jnp.where(fine, new, old)  # noqa: E731
     return state.replace(
         qpos=keep(d.qpos, state.qpos),
         qvel=keep(d.qvel, state.qvel),
         qacc_warmstart=keep(d.qacc_warmstart, state.qacc_warmstart),
         diverged=~fine,
-        pair_overflows=state.pair_overflows + (counts.pairs > model.limits.max_geom_pairs),
-        contact_overflows=state.contact_overflows + (counts.contacts > model.limits.max_contact_points),
-        max_pairs=jnp.maximum(state.max_pairs, counts.pairs),
+        pair_overflows=state.pair_overflows + too_many_pairs,
+        contact_overflows=state.contact_overflows + (counts.contacts > limits.max_contact_points),
+        max_hull_pairs=jnp.maximum(state.max_hull_pairs, counts.hull_pairs),
+        max_robot_pairs=jnp.maximum(state.max_robot_pairs, counts.robot_pairs),
         max_contacts=jnp.maximum(state.max_contacts, counts.contacts),
     )

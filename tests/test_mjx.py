@@ -1,0 +1,406 @@
+"""The `mjx` engine against C MuJoCo on the same hulls and options, and against exact geometry."""
+
+import dataclasses
+from importlib import metadata
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from mjx_oracle import CoarseModel, Touch, deepest, least_translation, overlap_along
+from mujoco import mjx as mujoco_mjx
+
+from pregrasp_jax import primitives
+from pregrasp_jax.assets.bank import select
+from pregrasp_jax.assets.catalogue import builtin_bank
+from pregrasp_jax.config import SceneConfig
+from pregrasp_jax.physics import make_engine, mjx, mjx_model, mjx_version
+from pregrasp_jax.physics.hull_collision import ContactCounts, Limits, collide
+from pregrasp_jax.robot import model as robot
+from pregrasp_jax.scene import bank as scene_bank
+from pregrasp_jax.scene.model import parking_poses
+from pregrasp_jax.types import CLOSED, OPEN, MAX_HULLS, MAX_OBJECTS, SceneParams
+
+NUM_STATES = 200
+AMPLE = Limits(max_hull_pairs=96, max_robot_pairs=64, max_contact_points=192)
+"""Nothing is dropped in the states of these tests."""
+
+NUM_SLOTS = 3
+SCENES = ((0, 3, 1), (13, 8, -1))
+"""Object ids of the seen set: a row of three (1, 5 and 1 hulls) and one of two (2 and 1), in front of the hand."""
+
+ROW_START, ROW_GAP = -0.19, 0.002
+"""m; where a row begins, just beyond the closed fingers, and between its objects."""
+
+
+@pytest.fixture(scope="module")
+def bank():
+    return builtin_bank("seen")
+
+
+@pytest.fixture(scope="module")
+def model(bank):
+    return mjx_model.make_mjx_slot_model(bank, limits=AMPLE)
+
+
+@pytest.fixture(scope="module")
+def oracle(bank, model):
+    return CoarseModel(bank, model.mj_model)
+
+
+@pytest.fixture(scope="module")
+def contacts_of(model):
+    """(object_ids [S, 8], qpos [S, nq]) -> contacts [S, n] and counts [S], all states in one call."""
+    template = mujoco_mjx.make_data(model.mjx_model)
+
+    def contacts_of_one(object_ids, qpos):
+        m, hull_ids = mjx_model.fill_slots(model, object_ids)
+        with jax.numpy_rank_promotion("allow"):  # MJX's own code needs it
+            data = mujoco_mjx.kinematics(m, template.replace(qpos=qpos))
+            data, counts = collide(m, data, model.hulls, hull_ids, model.limits)
+        contact = data._impl.contact
+        return (contact.geom, contact.dist, contact.frame[:, 0], contact.friction, contact.solref, contact.solimp), counts
+
+    return jax.jit(jax.vmap(contacts_of_one))
+
+
+def shaken(poses: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Press packed objects into each other by some millimetres and tilt them a little."""
+    poses = poses.astype(np.float64).copy()
+    poses[:, :2] *= rng.uniform(0.95, 1.0)
+    poses[:, :3] += rng.normal(0, 0.0015, (len(poses), 3))
+    poses[:, 3:] += rng.normal(0, 0.01, (len(poses), 4))
+    return poses
+
+
+def around_the_arm(poses: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Scatter objects where the start pose has its hand and its wrist."""
+    low, high = [-0.5, -0.1, 0.0], [-0.18, 0.1, 0.15]
+    return np.concatenate([rng.uniform(low, high, (len(poses), 3)), rng.normal(size=(len(poses), 4))], axis=1)
+
+
+class Pair(NamedTuple):
+    """The deepest contact of one pair of geoms by C and by us (None: no contact), and the exact penetration.
+
+    `least` is the least translation that parts the two, `along` the one along our normal; None where one is round.
+    """
+
+    kind: str
+    names: tuple[str, str]
+    reference: Touch | None
+    ours: Touch | None
+    least: float | None
+    along: float | None
+
+
+@pytest.fixture(scope="module")
+def pairs(bank, model, oracle, contacts_of) -> list[Pair]:
+    """All pairs that touch in 200 random states: packed and pressed together, or scattered around the arm."""
+    scenes = scene_bank.load_or_build(bank, SceneConfig(test_scenes=3), "test")
+    data = mujoco.MjData(model.mj_model)
+    robot.set_home(model.mj_model, data)
+    rng = np.random.default_rng(0)
+    index = np.arange(NUM_STATES) % len(scenes)
+    object_ids, qpos = scenes.object_ids[index].copy(), np.tile(data.qpos, (NUM_STATES, 1))
+    for row, i in enumerate(index):
+        if row % 2:
+            object_ids[row, rng.permutation(MAX_OBJECTS)[:4]] = -1
+        disturb = around_the_arm if row % 2 else shaken
+        poses = np.where((object_ids[row] >= 0)[:, None], disturb(scenes.poses[i], rng), parking_poses())
+        qpos[row, model.qpos_ids] = poses / np.where(np.arange(7) < 3, 1, np.linalg.norm(poses[:, 3:], axis=1)[:, None])
+    (geom, dist, normal, *parameters), counts = jax.tree.map(
+        np.asarray, contacts_of(object_ids, jnp.asarray(qpos, jnp.float32))
+    )
+    assert counts.hull_pairs.max() <= AMPLE.max_hull_pairs
+    assert counts.robot_pairs.max() <= AMPLE.max_robot_pairs
+    assert counts.contacts.max() <= AMPLE.max_contact_points
+    names = np.array([model.mj_model.geom(g).name for g in range(model.mj_model.ngeom)])
+    found = []
+    for s in range(NUM_STATES):
+        state = oracle.fill(object_ids[s], qpos[s, model.qpos_ids])
+        reference = oracle.touches(state)
+        mixed = np.concatenate([values[s] for values in parameters], axis=1)
+        ours = deepest(
+            [(*names[geom[s, k]], dist[s, k], normal[s, k], mixed[k]) for k in np.flatnonzero(dist[s] < 0)]
+        )
+        found += [describe(oracle, state, key, reference.get(key), ours.get(key)) for key in reference | ours]
+    return found
+
+
+def describe(oracle, state, names, reference, ours) -> Pair:
+    """Classify a pair and add its exact penetration."""
+    if "table" in names:
+        return Pair("table", names, reference, ours, None, None)
+    if any(oracle.model.geom(name).type[0] == mujoco.mjtGeom.mjGEOM_CAPSULE for name in names):
+        return Pair("capsule", names, reference, ours, None, None)
+    kind = "hulls" if all(name.startswith("slot") for name in names) else "box"
+    a, b = (oracle.corners(state, name) for name in names)
+    along = overlap_along(a, b, ours.normal) if ours else None
+    return Pair(kind, names, reference, ours, least_translation(a, b), along)
+
+
+def test_the_same_pairs_touch(pairs):
+    """All pairs that C finds deeper than 10 um, and none that it does not: no absent hull, no parked slot."""
+    kinds = {"table": 0, "hulls": 0, "box": 0}
+    for pair in pairs:
+        if pair.kind in kinds:
+            kinds[pair.kind] += 1
+            if (pair.ours is None) != (pair.reference is None):
+                assert max(touch.dist for touch in pair[2:4] if touch) > -1e-5, pair
+    assert min(kinds.values()) > NUM_STATES
+
+
+def test_contacts_with_the_table_agree_with_c(pairs):
+    for pair in pairs:
+        if pair.kind == "table" and pair.ours and pair.reference:
+            assert pair.ours.dist == pytest.approx(pair.reference.dist, abs=1e-6)
+            np.testing.assert_allclose(pair.ours.normal, pair.reference.normal, atol=1e-6)
+
+
+def test_the_least_translation_is_exact(pairs):
+    """Distance and normal against the Minkowski difference: 20 um, of which 10 um are the preference for faces."""
+    for pair in pairs:
+        if pair.least is not None and pair.ours:
+            assert pair.ours.dist == pytest.approx(-pair.least, abs=2e-5), pair
+            assert pair.along == pytest.approx(pair.least, abs=2e-5), pair
+
+
+def test_contacts_of_hulls_agree_with_c_where_c_is_exact(pairs):
+    """C stops before the least translation in some pairs, by up to 1 mm; in the others we agree, also in the normal."""
+    both = [pair for pair in pairs if pair.least is not None and pair.ours and pair.reference]
+    error = np.array([abs(pair.ours.dist - pair.reference.dist) for pair in both])
+    c_error = np.array([abs(pair.reference.dist + pair.least) for pair in both])
+    cosine = np.array([pair.ours.normal @ pair.reference.normal for pair in both])
+    assert np.percentile(error, 50) < 1e-6
+    assert np.percentile(error, 90) < 1e-4
+    assert (c_error < 1e-6).mean() > 0.5
+    assert error[c_error < 1e-6].max() < 2e-5
+    assert (cosine[c_error < 1e-6] > np.cos(np.radians(1.0))).mean() > 0.9
+
+
+def test_contacts_mix_friction_and_softness_as_c_does(pairs):
+    for pair in pairs:
+        if pair.ours and pair.reference:
+            np.testing.assert_allclose(pair.ours.parameters, pair.reference.parameters, rtol=1e-6)
+
+
+def test_a_slot_has_the_constants_of_a_separately_filled_model(model, oracle):
+    """Everything that differs between objects, with eight of them at once; the compiled median object is a decoy."""
+    object_ids = np.array([16, 3, -1, 13, 5, 0, 8, 6])
+    oracle.fill(object_ids, parking_poses())
+    filled, hull_ids = mjx_model.fill_slots(model, jnp.asarray(object_ids))
+    for names, ours, theirs in (
+        (mjx_model.BODY_FIELDS, model.body_ids, oracle.slots.slot_body_ids),
+        (mjx_model.DOF_FIELDS, model.dof_ids, oracle.slots.slot_dof_ids),
+        (("geom_friction",), model.geom_ids, oracle.slots.slot_geom_ids),
+    ):
+        for name in names:
+            expected = getattr(oracle.model, name)[theirs]
+            np.testing.assert_allclose(getattr(filled, name)[ours], expected, rtol=1e-5, atol=1e-9, err_msg=name)
+    compiled = model.mj_model.body_invweight0[model.body_ids]
+    assert np.abs(filled.body_invweight0[model.body_ids] / compiled - 1).max() > 0.5
+    present = np.asarray(hull_ids)[model.geom_ids] >= 0
+    np.testing.assert_array_equal(present, oracle.model.geom_contype[oracle.slots.slot_geom_ids] > 0)
+    robot_bodies = np.setdiff1d(np.arange(model.mj_model.nbody), model.body_ids)
+    np.testing.assert_array_equal(
+        filled.body_invweight0[robot_bodies], model.mj_model.body_invweight0[robot_bodies].astype(np.float32)
+    )
+
+
+def test_hulls_keep_their_shape_in_the_table(bank, model):
+    """Faces bound the vertices, every corner lies on its face, and Euler's formula holds for what is not padding."""
+    table = jax.tree.map(np.asarray, model.hulls)
+    for hull, coarse in enumerate(np.asarray(bank.coarse.vertices)):
+        normal, face, edge = table.face_normal[hull], table.face[hull], table.edge[hull]
+        np.testing.assert_allclose(table.vert[hull] + table.centre[hull], coarse, atol=1e-7)
+        offset = np.einsum("fi,fpi->fp", normal, face)
+        assert np.ptp(offset, axis=1).max() < 5e-6
+        assert (table.vert[hull] @ normal.T - offset[:, 0]).max() < 5e-6
+        vertices = len(np.unique(coarse, axis=0))
+        faces = len(np.unique(np.hstack([normal, offset[:, :1]]), axis=0))
+        edges = len(np.unique(np.sort(edge, axis=1), axis=0))
+        assert vertices - edges + faces == 2
+        for (a, b), normals in zip(edge, table.edge_face_normal[hull], strict=True):
+            along = table.vert[hull][b] - table.vert[hull][a]
+            assert np.abs(normals @ along).max() < 5e-6
+
+
+@pytest.fixture(scope="module")
+def engine(bank):
+    return mjx.make_engine(bank, num_slots=NUM_SLOTS, num_hulls=MAX_HULLS)
+
+
+def row_of(bank, object_ids) -> SceneParams:
+    """Objects [<= MAX_OBJECTS] one behind the other along x, and a little to the side of each other."""
+    poses = parking_poses().astype(np.float32)
+    x = ROW_START
+    for slot, object_id in enumerate(object_ids):
+        if object_id >= 0:
+            hulls = np.asarray(bank.object_hulls)[object_id]
+            low, high = np.array([f(np.asarray(bank.full.vertices)[hulls[hulls >= 0], :, 0]) for f in (np.min, np.max)])
+            poses[slot, :3] = x - low, 0.01 * slot, 0.0
+            x += high - low + ROW_GAP
+    ids = np.append(object_ids, np.full(MAX_OBJECTS - len(object_ids), -1))
+    return SceneParams(jnp.asarray(ids, jnp.int32), jnp.asarray(poses), jnp.int32(0))
+
+
+@pytest.fixture(scope="module")
+def plans():
+    """Pushes of 10 and 7 cm with closed fingers."""
+    home = jnp.asarray(robot.home_joint_pos()[:6])
+    ends = ((-0.2, 0.0), (-0.23, 0.01))
+    rows = primitives.num_push_rows(0.1, 0.1)
+    return [
+        primitives.plan_push(
+            home,
+            jnp.asarray(robot.START_POSE[:2]),
+            jnp.asarray(end),
+            jnp.int32(OPEN),
+            jnp.int32(CLOSED),
+            push_speed=0.1,
+            num_rows=rows,
+        )
+        for end in ends
+    ]
+
+
+def stack(items):
+    return jax.tree.map(lambda *x: jnp.stack(x), *items)
+
+
+@pytest.fixture(scope="module")
+def pushed(bank, engine, plans):
+    """(run of a batch, its traces, states before and after a batch of both scenes)."""
+    traces = []
+
+    def counted(state, ctrl, num_ctrl):
+        traces.append(1)
+        return engine.run(state, ctrl, num_ctrl)
+
+    run = jax.jit(jax.vmap(counted))
+    states = stack([engine.reset(engine.init(), row_of(bank, scene)) for scene in SCENES])
+    both = stack(plans)
+    return run, traces, states, run(states, both.ctrl, both.num_ctrl)
+
+
+def test_a_push_moves_objects_as_c_does(bank, model, oracle, engine, plans, pushed):
+    """Coarse hulls and options of the engine: final poses within 5 mm of C after a push that moves them by centimetres."""
+    *_, after = pushed
+    seen = jax.vmap(engine.observe)(after)
+    for i, object_ids in enumerate(SCENES):
+        count = sum(o >= 0 for o in object_ids)
+        poses = np.asarray(row_of(bank, object_ids).poses, np.float64)
+        data = oracle.fill(np.array(object_ids), poses[: len(object_ids)])
+        reference = oracle.push(data, np.asarray(plans[i].ctrl), int(plans[i].num_ctrl))
+        moved = np.linalg.norm(reference[:count, :2] - poses[:count, :2], axis=1)
+        error = np.linalg.norm(np.asarray(seen.object_poses)[i, :count, :3] - reference[:count, :3], axis=1)
+        assert moved.max() > 0.02
+        assert error.max() < 0.005, (moved, error)
+        np.testing.assert_allclose(seen.joint_pos[i], data.qpos[robot.joint_qpos_ids(model.mj_model)], atol=2e-3)
+    assert not seen.diverged.any()
+    assert not after.pair_overflows.any()
+    assert not after.contact_overflows.any()
+    assert after.max_contacts.min() > 4
+
+
+def test_scenes_do_not_depend_on_their_batch(engine, plans, pushed):
+    """Two sets of objects, of different number, in one batch and each alone: same up to rounding."""
+    run, _, states, after = pushed
+    for i in range(2):
+        twice = jax.tree.map(lambda x, i=i: jnp.stack([x[i]] * 2), (states, stack(plans)))
+        same = run(twice[0], twice[1].ctrl, twice[1].num_ctrl)
+        np.testing.assert_array_equal(same.qpos[0], after.qpos[i])
+    alone = jax.jit(engine.run)
+    for i in range(2):
+        state = alone(jax.tree.map(lambda x, i=i: x[i], states), plans[i].ctrl, plans[i].num_ctrl)
+        np.testing.assert_allclose(state.qpos, after.qpos[i], atol=1e-3)
+
+
+def test_parked_slots_stay_and_finished_scenes_freeze(engine, plans, pushed):
+    run, _, states, after = pushed
+    np.testing.assert_allclose(after.qpos[1][-7:], states.qpos[1][-7:], atol=1e-5)
+    both = stack(plans)
+    frozen = run(states, both.ctrl, jnp.array([1, 0]))
+    for old, new in zip(jax.tree.leaves(states), jax.tree.leaves(frozen), strict=True):
+        np.testing.assert_array_equal(old[1], new[1])
+    assert (frozen.qpos[0] != states.qpos[0]).any()
+
+
+def test_only_the_scene_that_diverges_ends(plans, pushed):
+    """Too fast, too deep, below the table, not a number: that scene keeps its last state, the other one goes on."""
+    run, _, states, _ = pushed
+    both = stack(plans)
+    slot = states.qpos.shape[1] - 21
+    broken = {
+        "fast": states.replace(qvel=states.qvel.at[0, -15].set(150.0)),
+        "deep": states.replace(qpos=states.qpos.at[0, slot + 7 : slot + 10].set(states.qpos[0, slot : slot + 3])),
+        "fallen": states.replace(qpos=states.qpos.at[0, slot + 2].set(-0.06)),
+        "nan": states.replace(qpos=states.qpos.at[0, slot].set(jnp.nan)),
+    }
+    for name, bad in broken.items():
+        after = run(bad, both.ctrl, jnp.array([2, 2]))
+        np.testing.assert_array_equal(after.diverged, [True, False], err_msg=name)
+        np.testing.assert_array_equal(after.qpos[0], bad.qpos[0], err_msg=name)
+        again = run(after, both.ctrl, jnp.array([2, 2]))
+        np.testing.assert_array_equal(again.diverged, [True, False], err_msg=name)
+        np.testing.assert_array_equal(again.qpos[0], bad.qpos[0], err_msg=name)
+
+
+def test_one_trace_serves_all_objects(pushed):
+    """Runs last of those that use the fixture: batches of other objects and plans did not trace again."""
+    assert len(pushed[1]) == 1
+
+
+def test_what_is_dropped_is_counted(model):
+    """A step that had more pairs or contacts than fit is counted, one at the limit is not."""
+    limits = Limits(max_hull_pairs=2, max_robot_pairs=2, max_contact_points=4)
+    small = dataclasses.replace(model, limits=limits)
+    engine_state = mjx.MjxState(
+        *(jnp.zeros(model.mj_model.nq), jnp.zeros(model.mj_model.nv), jnp.zeros(model.mj_model.nv)),
+        *(jnp.full(MAX_OBJECTS, -1), jnp.array(False), *[jnp.int32(0)] * 5),
+    )
+    data = mujoco_mjx.make_data(model.mjx_model)
+    for hulls, hand, contacts, pair_overflows, contact_overflows in ((2, 2, 4, 0, 0), (3, 0, 4, 1, 0), (0, 3, 5, 1, 1)):
+        counts = ContactCounts(jnp.int32(hulls), jnp.int32(hand), jnp.int32(contacts), jnp.float32(0))
+        state = mjx.guarded(small, engine_state, data, counts)
+        assert (int(state.pair_overflows), int(state.contact_overflows)) == (pair_overflows, contact_overflows)
+        assert (int(state.max_hull_pairs), int(state.max_contacts)) == (hulls, contacts)
+
+
+def test_a_scene_with_more_objects_than_slots_is_marked(bank, engine):
+    scene = row_of(bank, (0, 1, 2))
+    assert not engine.observe(engine.reset(engine.init(), scene)).diverged
+    fourth = dataclasses.replace(scene, object_ids=scene.object_ids.at[NUM_SLOTS].set(1))
+    assert engine.observe(engine.reset(engine.init(), fourth)).diverged
+
+
+def test_what_does_not_fit_is_refused_in_one_line(bank):
+    with pytest.raises(ValueError, match=r"object '.*' has 6 hulls; a slot of the mjx engine holds 1 to 5"):
+        mjx.make_engine(bank, num_hulls=5)
+    with pytest.raises(ValueError, match="num_slots = 9; allowed are 1 to 8"):
+        mjx.make_engine(bank, num_slots=9)
+
+
+def test_another_mjx_is_refused_by_name():
+    mjx_version.require(metadata.version("mujoco-mjx"))
+    with pytest.raises(ValueError, match=r"mujoco-mjx 4\.0\.0 is installed; allowed: 3\.17\.0"):
+        mjx_version.require("4.0.0")
+
+
+def test_the_engine_is_chosen_by_name(bank):
+    assert make_engine("mjx", select(bank, [0, 3])).name == "mjx"
+
+
+@pytest.mark.slow
+def test_three_thousand_steps_do_not_hang(engine, plans, pushed):
+    """On two cores MJX programs deadlock unless the package has raised NPROC (FACTS: 9 of 9 within 103 steps)."""
+    run, _, state, _ = pushed
+    hold = jnp.broadcast_to(jnp.asarray(robot.home_joint_pos()[:7]), (2, *plans[0].ctrl.shape))
+    rows = plans[0].ctrl.shape[0]
+    steps = 0
+    while steps < 3000:
+        state = jax.block_until_ready(run(state, hold, jnp.array([rows, rows])))
+        steps += 5 * rows
+    assert not state.diverged.any()
