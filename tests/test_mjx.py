@@ -21,7 +21,7 @@ from pregrasp_jax.physics.hull_collision import ContactCounts, Limits, collide
 from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses
-from pregrasp_jax.types import CLOSED, OPEN, MAX_HULLS, MAX_OBJECTS, SceneParams
+from pregrasp_jax.types import CLOSED, MAX_HULLS, MAX_OBJECTS, OPEN, SceneParams
 
 NUM_STATES = 200
 AMPLE = Limits(max_hull_pairs=96, max_robot_pairs=64, max_contact_points=192)
@@ -61,7 +61,8 @@ def contacts_of(model):
             data = mujoco_mjx.kinematics(m, template.replace(qpos=qpos))
             data, counts = collide(m, data, model.hulls, hull_ids, model.limits)
         contact = data._impl.contact
-        return (contact.geom, contact.dist, contact.frame[:, 0], contact.friction, contact.solref, contact.solimp), counts
+        parameters = contact.friction, contact.solref, contact.solimp
+        return (contact.geom, contact.dist, contact.frame[:, 0], *parameters), counts
 
     return jax.jit(jax.vmap(contacts_of_one))
 
@@ -122,9 +123,7 @@ def pairs(bank, model, oracle, contacts_of) -> list[Pair]:
         state = oracle.fill(object_ids[s], qpos[s, model.qpos_ids])
         reference = oracle.touches(state)
         mixed = np.concatenate([values[s] for values in parameters], axis=1)
-        ours = deepest(
-            [(*names[geom[s, k]], dist[s, k], normal[s, k], mixed[k]) for k in np.flatnonzero(dist[s] < 0)]
-        )
+        ours = deepest([(*names[geom[s, k]], dist[s, k], normal[s, k], mixed[k]) for k in np.flatnonzero(dist[s] < 0)])
         found += [describe(oracle, state, key, reference.get(key), ours.get(key)) for key in reference | ours]
     return found
 
@@ -286,7 +285,11 @@ def pushed(bank, engine, plans):
 
 
 def test_a_push_moves_objects_as_c_does(bank, model, oracle, engine, plans, pushed):
-    """Coarse hulls and options of the engine: final poses within 5 mm of C after a push that moves them by centimetres."""
+    """Same hulls and options: final poses within 10 mm of C after pushes that move them by 17 and 47 mm.
+
+    Pushing a row is unstable: in float32 a shift of 1e-7 m at the start becomes up to 6 mm at the end (C in float64:
+    a shift of 1e-4 m becomes 3 mm), so nearer agreement than that would be luck.
+    """
     *_, after = pushed
     seen = jax.vmap(engine.observe)(after)
     for i, object_ids in enumerate(SCENES):
@@ -296,8 +299,8 @@ def test_a_push_moves_objects_as_c_does(bank, model, oracle, engine, plans, push
         reference = oracle.push(data, np.asarray(plans[i].ctrl), int(plans[i].num_ctrl))
         moved = np.linalg.norm(reference[:count, :2] - poses[:count, :2], axis=1)
         error = np.linalg.norm(np.asarray(seen.object_poses)[i, :count, :3] - reference[:count, :3], axis=1)
-        assert moved.max() > 0.02
-        assert error.max() < 0.005, (moved, error)
+        assert moved.min() > 0.01
+        assert error.max() < 0.010, (moved, error)
         np.testing.assert_allclose(seen.joint_pos[i], data.qpos[robot.joint_qpos_ids(model.mj_model)], atol=2e-3)
     assert not seen.diverged.any()
     assert not after.pair_overflows.any()
@@ -306,16 +309,21 @@ def test_a_push_moves_objects_as_c_does(bank, model, oracle, engine, plans, push
 
 
 def test_scenes_do_not_depend_on_their_batch(engine, plans, pushed):
-    """Two sets of objects, of different number, in one batch and each alone: same up to rounding."""
+    """Two sets of objects, of different number: the same bits beside any neighbour, and the same as alone.
+
+    Alone is another XLA program, whose rounding differs, so it is compared before contact has amplified that.
+    """
     run, _, states, after = pushed
-    for i in range(2):
-        twice = jax.tree.map(lambda x, i=i: jnp.stack([x[i]] * 2), (states, stack(plans)))
-        same = run(twice[0], twice[1].ctrl, twice[1].num_ctrl)
-        np.testing.assert_array_equal(same.qpos[0], after.qpos[i])
+    both = stack(plans)
+    short = run(states, both.ctrl, jnp.array([15, 10]))
     alone = jax.jit(engine.run)
-    for i in range(2):
-        state = alone(jax.tree.map(lambda x, i=i: x[i], states), plans[i].ctrl, plans[i].num_ctrl)
-        np.testing.assert_allclose(state.qpos, after.qpos[i], atol=1e-3)
+    for i, rows in enumerate((15, 10)):
+        twice, plan = jax.tree.map(lambda x, i=i: jnp.stack([x[i]] * 2), (states, both))
+        same = run(twice, plan.ctrl, plan.num_ctrl)
+        np.testing.assert_array_equal(same.qpos[0], after.qpos[i])
+        np.testing.assert_array_equal(same.qpos[1], after.qpos[i])
+        state = alone(jax.tree.map(lambda x, i=i: x[i], states), plans[i].ctrl, jnp.int32(rows))
+        np.testing.assert_allclose(state.qpos, short.qpos[i], atol=1e-4)
 
 
 def test_parked_slots_stay_and_finished_scenes_freeze(engine, plans, pushed):

@@ -137,12 +137,13 @@ def _narrow_phase(
     m: mjx.Model, d: mjx.Data, key: FunctionKey, geom: jax.Array, hulls: HullTable, hull_ids: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return dist [n], pos [n, 3] and frame [n, 3, 3] of the contacts of pairs [P, 2] of one kind, n = P * ncon."""
-    if key.types[1] != GeomType.MESH:
-        return collision_driver._COLLISION_FUNC[key.types](m, d, key, geom)
+    kinds = GeomType(key.types[0]), GeomType(key.types[1])
+    if kinds[1] != GeomType.MESH:
+        return collision_driver._COLLISION_FUNC[kinds](m, d, key, geom)
     (first, first_axes), (second, _) = (
-        _shape(m, d, kind, ids, hulls, hull_ids) for kind, ids in zip(key.types, geom.T, strict=True)
+        _shape(m, d, kind, ids, hulls, hull_ids) for kind, ids in zip(kinds, geom.T, strict=True)
     )
-    dist, pos, normal = jax.vmap(_COLLIDERS[key.types[0]], in_axes=(first_axes, 0))(first, second)
+    dist, pos, normal = jax.vmap(_COLLIDERS[kinds[0]], in_axes=(first_axes, 0))(first, second)
     frame = jax.vmap(jax.vmap(math.make_frame))(normal)
     return dist.reshape(-1), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)
 
@@ -162,7 +163,7 @@ def _shape(
 
 
 def plane_hull(plane: GeomInfo, hull: ConvexInfo) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return dist [4], pos [4, 3] and normal [4, 3] of a hull on a plane: four spread vertices within 1 mm of the lowest.
+    """Return dist [4], pos [4, 3] and normal [4, 3] of a hull on a plane: vertices within 1 mm of the lowest, spread.
 
     Source: agrees with `mjc_PlaneConvex` on the deepest point within 1e-6 m (tests/test_mjx.py).
     """

@@ -11,7 +11,6 @@ import flax.struct as struct
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import constraint, forward, smooth, solver
 

@@ -17,10 +17,12 @@ from pregrasp_jax.scene import model as slot_model
 from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, HullBank
 
 ITERATIONS, LS_ITERATIONS = 20, 8
+"""Of Newton and of its line search. 100 and 50 change final poses of pushes by no more than rounding does (a few mm
+where a row of objects is pushed, see tests/test_mjx.py); MJX always runs all steps of the line search."""
 
 BODY_FIELDS = (*slot_model.BODY_FIELDS, "body_subtreemass", "body_invweight0")
 DOF_FIELDS = ("dof_invweight0", "dof_M0")
-"""Of a slot's body and its six degrees of freedom; the last two of the body and these are what `mj_setConst` derives."""
+"""Of a slot's body and its degrees of freedom; these and the last two of the body are what `mj_setConst` derives."""
 
 
 class ObjectTable(struct.PyTreeNode):
@@ -84,7 +86,7 @@ def make_mjx_slot_model(
             raise ValueError(f"object {name!r} has {count} hulls; a slot of the mjx engine holds 1 to {num_hulls}")
     hulls = make_hull_table(bank.coarse)
     spec = robot.load_spec()
-    _set_options(spec, limits)
+    set_options(spec, limits)
     _add_slots(spec, bank, num_slots, num_hulls)
     mj_model = spec.compile()
     bodies = [mj_model.body(f"slot_{i}") for i in range(num_slots)]
@@ -117,15 +119,20 @@ def fill_slots(model: MjxSlotModel, object_ids: jax.Array) -> tuple[mjx.Model, j
     return m.replace(**fields), hull_ids
 
 
-def _set_options(spec: mujoco.MjSpec, limits: Limits) -> None:
-    """Choose what MJX does well: a pyramidal cone, Newton with dense matrices, and one contact dimension."""
+def set_options(spec: mujoco.MjSpec, limits: Limits | None) -> None:
+    """Choose what MJX does well: a pyramidal cone, Newton with dense matrices, and one contact dimension.
+
+    Elliptic cones build a matrix of all constraint rows squared; other contact dimensions would double the groups of
+    the hand. Without limits MJX keeps every contact.
+    """
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     spec.option.impratio = 1
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     spec.option.iterations, spec.option.ls_iterations = ITERATIONS, LS_ITERATIONS
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    spec.add_numeric(name="max_contact_points", data=[limits.max_contact_points], size=1)
+    if limits is not None:
+        spec.add_numeric(name="max_contact_points", data=[limits.max_contact_points], size=1)
     for geom in spec.geoms:
         geom.condim = 3
 

@@ -16,7 +16,8 @@ def require(installed: str) -> None:
         ValueError: `installed` is not in `SUPPORTED`.
     """
     if installed not in SUPPORTED:
-        raise ValueError(f"physics.engine = 'mjx': mujoco-mjx {installed} is installed; allowed: {', '.join(SUPPORTED)}")
+        allowed = ", ".join(SUPPORTED)
+        raise ValueError(f"physics.engine = 'mjx': mujoco-mjx {installed} is installed; allowed: {allowed}")
 
 
 require(metadata.version("mujoco-mjx"))

@@ -76,8 +76,10 @@ def _rotate(vectors: jax.Array, turn: jax.Array) -> jax.Array:
 
 
 def _best_face(a: _Placed, b: _Placed) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Return the widest gap along any face normal, that normal from a to b, the faces of a and b that meet there,
-    and whether the normal is one of a's.
+    """Return the widest gap along any face normal, and where it is.
+
+    Returns:
+        The gap, that normal from a to b, the faces of a and of b that meet there, and whether the normal is one of a's.
     """
     gap_a = _dots(b.vert, a.normal).min(axis=0) - a.offset
     gap_b = _dots(a.vert, b.normal).min(axis=0) - b.offset
