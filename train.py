@@ -39,7 +39,7 @@ def _start(preset: Config) -> Callable[..., Command]:
         """
         from pregrasp_jax.training.session import train
 
-        return functools.partial(train, config.validate(), run_dir, init_from=init_from)
+        return _reported(functools.partial(train, config.validate(), run_dir, init_from=init_from), run_dir)
 
     return start
 
@@ -56,9 +56,22 @@ def _resume(stored: Config) -> Callable[..., Command]:
         """
         from pregrasp_jax.training.session import resume
 
-        return functools.partial(resume, config.validate(), run_dir)
+        return _reported(functools.partial(resume, config.validate(), run_dir), run_dir)
 
     return resume
+
+
+def _reported(session: Command, run_dir: Path) -> Command:
+    """Return a session that leaves the report of the run behind; one that is refused leaves nothing."""
+
+    def run() -> int:
+        code = session()
+        from pregrasp_jax.cli.report import report_session
+
+        report_session(run_dir)
+        return code
+
+    return run
 
 
 def _stored_config() -> Config:

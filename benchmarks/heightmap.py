@@ -11,8 +11,6 @@ import argparse
 import json
 import os
 import platform
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
@@ -24,6 +22,7 @@ import mujoco
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
+from timing import best_ms
 
 from pregrasp_jax import grid, heightmap
 from pregrasp_jax.assets.catalogue import builtin_bank
@@ -59,17 +58,6 @@ def make_scenes(bank: HullBank, count: int, rng: np.random.Generator) -> tuple[S
     assert not np.isnan(joint_pos).any(), "a hand pose is out of reach"
     scene = SceneParams(jnp.asarray(np.stack(ids), jnp.int32), poses, jnp.zeros(count, jnp.int32))
     return scene, PhysicsObservation(poses, joint_pos, hand_pose, jnp.zeros(count, bool))
-
-
-def best_ms(function: Callable[[], object], repetitions: int) -> float:
-    """Return the shortest of `repetitions` calls, after one that compiles."""
-    jax.block_until_ready(function())
-    times = []
-    for _ in range(repetitions):
-        start = time.perf_counter()
-        jax.block_until_ready(function())
-        times.append(time.perf_counter() - start)
-    return 1e3 * min(times)
 
 
 def add_mesh(spec: mujoco.MjSpec, name: str, vertices: np.ndarray, faces: np.ndarray, pose: np.ndarray) -> None:
@@ -200,7 +188,7 @@ def measure(args: argparse.Namespace) -> dict[str, float]:
             return heightmap.observe(hulls, physics_obs.hand_pose[:2], camera=view)
 
         run = jax.jit(jax.vmap(look))
-        return best_ms(lambda: run(scene, physics_obs), args.repetitions) / args.scenes
+        return best_ms(lambda: run(scene, physics_obs), repetitions=args.repetitions) / args.scenes
 
     result = {"orthographic_ms_per_scene": timed("orthographic"), "pinhole_ms_per_scene": timed(camera)}
     rows = [jax.tree.map(lambda leaf, i=i: leaf[i], (hulls, physics_obs, scene)) for i in range(args.scenes)]

@@ -12,8 +12,6 @@ import itertools
 import json
 import os
 import platform
-import time
-from collections.abc import Callable
 
 import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
 
@@ -21,6 +19,7 @@ import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
 import jax
 import jax.numpy as jnp
 import optax
+from timing import best_ms
 
 from pregrasp_jax.config import NetworkConfig, TaskConfig
 from pregrasp_jax.grid import GRID_SIZE
@@ -31,17 +30,6 @@ from pregrasp_jax.learning.replay import Batch
 from pregrasp_jax.primitives import half_ring_mask
 
 MATMUL_SIZE = 2048
-
-
-def best_seconds(function: Callable[[], object], *, repetitions: int, seconds: float) -> float:
-    """Return the shortest of at least three and at most `repetitions` calls within about `seconds`."""
-    jax.block_until_ready(function())
-    times: list[float] = []
-    while len(times) < 3 or (len(times) < repetitions and sum(times) < seconds):
-        start = time.perf_counter()
-        jax.block_until_ready(function())
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 def forward_gflop(width: float) -> float:
@@ -103,10 +91,10 @@ def measure(width: float, batch: Batch, *, repetitions: int, seconds: float) -> 
         return errors
 
     options = {"repetitions": repetitions, "seconds": seconds}
-    per_sample = 1e3 / batch.action.shape[0]
+    per_sample = 1 / batch.action.shape[0]
     return {
-        "forward_ms": per_sample * best_seconds(lambda: forward(params, batch.inputs), **options),
-        "update_ms": per_sample * best_seconds(step, **options),
+        "forward_ms": per_sample * best_ms(lambda: forward(params, batch.inputs), **options),
+        "update_ms": per_sample * best_ms(step, **options),
         "parameters": num_parameters(params),
     }
 
@@ -124,7 +112,7 @@ def main() -> None:
     results = {str(width): measure(width, batch, **options) for width in args.widths}
     matrix = jax.random.normal(jax.random.key(1), (MATMUL_SIZE, MATMUL_SIZE))
     matmul = jax.jit(jnp.matmul)
-    matmul_rate = 2 * MATMUL_SIZE**3 / 1e9 / best_seconds(lambda: matmul(matrix, matrix), **options)
+    matmul_rate = 2 * MATMUL_SIZE**3 / 1e6 / best_ms(lambda: matmul(matrix, matrix), **options)
     rates = {key: forward_gflop(float(key)) / value["forward_ms"] * 1e3 for key, value in results.items()}
     print(
         json.dumps(

@@ -15,12 +15,12 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from timing import best_ms
 
 from pregrasp_jax.checkpoint.state import save
 from pregrasp_jax.config import PRESETS, Config
@@ -31,17 +31,6 @@ from pregrasp_jax.training.program import Program, TrainState, make_program
 
 STEPS = 40
 """Parallel steps that fill the memory before anything is timed."""
-
-
-def best_ms(function: Callable[[], object], *, repetitions: int = 10) -> float:
-    """Return the shortest of several calls, in ms; the first one compiles and does not count."""
-    jax.block_until_ready(function())
-    times = []
-    for _ in range(repetitions):
-        start = time.perf_counter()
-        jax.block_until_ready(function())
-        times.append(time.perf_counter() - start)
-    return 1e3 * min(times)
 
 
 def fill(program: Program, state: TrainState) -> tuple[TrainState, Any]:

@@ -1,4 +1,4 @@
-"""Look at objects and scenes, compare evaluations, ask what the machine offers."""
+"""Look at objects, scenes and runs, compare evaluations, ask what the machine offers."""
 
 import functools
 import sys
@@ -8,6 +8,7 @@ import tyro
 
 from pregrasp_jax.cli import commands
 from pregrasp_jax.cli.demo import demo
+from pregrasp_jax.cli.report import report
 from pregrasp_jax.command_line import one_line_errors, parse
 
 COMMANDS = {
@@ -15,6 +16,7 @@ COMMANDS = {
     "compare": commands.compare,
     "demo": demo,
     "doctor": commands.doctor,
+    "report": report,
     "scenes": commands.scenes,
     "show": commands.show,
 }

@@ -268,8 +268,9 @@ PRESETS: dict[str, Config] = {
     "demo": dataclasses.replace(
         _CPU,
         scene=SceneConfig(train_scenes=64, validation_scenes=10, test_scenes=50),
-        replay=ReplayConfig(capacity=5_000, importance_steps=5_000),
-        exploration=ExplorationConfig(epsilon_decay=2_000, branches=3),
+        replay=ReplayConfig(capacity=10_000, importance_steps=2_000),
+        learner=dataclasses.replace(_CPU.learner, learning_rate_steps=4_000),
+        exploration=dataclasses.replace(_CPU.exploration, epsilon_decay=2_000),
         train=TrainConfig(num_envs=16, episodes=2_000, minutes=5.0, evaluate_every=0),
     ),
     "cpu": _CPU,

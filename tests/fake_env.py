@@ -64,6 +64,7 @@ class FakeEnv:
             jnp.zeros((MAX_OBJECTS, 7)),
             jnp.asarray(self.scenes.target, jnp.int32)[index],
         )
+        blank = jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8)
         return EnvState(
             physics=(),
             scene=scene,
@@ -71,7 +72,7 @@ class FakeEnv:
             physics_obs=PhysicsObservation(
                 jnp.zeros((MAX_OBJECTS, 7)), jnp.zeros(8), jnp.zeros(7), jnp.zeros((), bool)
             ),
-            obs=Observation(*(jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8) for _ in range(2)), jnp.zeros(2)),
+            obs=Observation(blank, blank, jnp.zeros(2)),
             centroids=jnp.asarray(self.scenes.xy)[index],
             p1=jnp.array(START),
             aperture=jnp.int32(OPEN),

@@ -95,9 +95,11 @@ def test_panel_draws_the_push_on_the_map_of_its_aperture():
     mask = np.zeros((100, 100), bool)
     mask[40:60, 20:40] = True
     action = int(grid.encode_action(jnp.int32(50), jnp.int32(35), jnp.int32(OPEN)))
-    panel = functools.partial(drawing.make_panel, hulls, obs, 0, p1=(-0.2, 0.0), mask=mask, title="test")
+    tiles = functools.partial(drawing.make_tiles, hulls, obs, 0, p1=(-0.2, 0.0), mask=mask)
     for q_values in (None, np.random.default_rng(0).normal(size=(100, 100, 2))):
-        with_push, without = panel(q_values=q_values, action=action), panel(q_values=q_values)
+        with_push, without = (
+            drawing.make_panel(tiles(q_values=q_values, action=chosen), title="test") for chosen in (action, None)
+        )
         assert with_push.shape == without.shape
         changed = np.nonzero((with_push != without).any(axis=(0, 2)))[0]
         assert changed.min() > with_push.shape[1] - 320

@@ -24,6 +24,7 @@ SECONDS_PER_FRAME = 1.5
 
 _COLUMNS, _TILE = 4, (240, 320)
 
+_GRASPED = f"{REASONS[TARGET_IN_REGION]}, grasped"
 
 _hulls = jax.jit(scene_hulls)
 
@@ -40,6 +41,11 @@ class Decision(NamedTuple):
     state: EnvState
     action: int | None
     ending: str
+
+    @property
+    def success(self) -> bool:
+        """Whether the episode has ended with the target in the hand."""
+        return self.ending == _GRASPED
 
 
 def film_episodes(path: Path, player: Player, *, episodes: int, seed: int) -> None:
@@ -89,7 +95,7 @@ def make_play(player: Player, seed: int) -> Callable[[int], Iterator[Decision]]:
                 break
         ending = REASONS[int(result.reason)]
         if result.reason == TARGET_IN_REGION:
-            ending += ", grasped" if grasp(state) else ", grasp failed"
+            ending = _GRASPED if grasp(state) else f"{ending}, grasp failed"
         yield Decision(state, None, ending)
 
     return play
@@ -108,8 +114,13 @@ def _in_batch(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def draw_panel(player: Player, decision: Decision) -> np.ndarray:
     """Return scene | height | segmentation | Q closed | Q open, with the half ring and the chosen push."""
+    return drawing.make_panel(draw_tiles(player, decision), title=" | ".join(describe_decision(player.env, decision)))
+
+
+def draw_tiles(player: Player, decision: Decision) -> list[tuple[str, np.ndarray]]:
+    """Return the pictures of `draw_panel`, each with its caption."""
     env, state = player.env, decision.state
-    return drawing.make_panel(
+    return drawing.make_tiles(
         _hulls(env.bank, state.scene, state.physics_obs),
         state.obs,
         int(state.scene.target),
@@ -117,19 +128,19 @@ def draw_panel(player: Player, decision: Decision) -> np.ndarray:
         mask=np.asarray(env.action_mask(state.p1)),
         q_values=None if player.q_values is None else np.asarray(player.q_values(state)),
         action=decision.action,
-        title=_title(env, decision),
     )
 
 
-def _title(env: Env, decision: Decision) -> str:
+def describe_decision(env: Env, decision: Decision) -> tuple[str, str, str]:
+    """Return which scene, which target, and what is done or how it ended."""
     state = decision.state
-    parts = [f"scene {int(state.scene_index)}", f"target {_target_name(env, state)}"]
+    scene, target = f"scene {int(state.scene_index)}", f"target {_target_name(env, state)}"
     if decision.action is None:
-        return " | ".join([*parts, f"{decision.ending} after {int(state.num_pushes)} pushes"])
+        return scene, target, f"{decision.ending} after {int(state.num_pushes)} pushes"
     row, col, aperture = grid.decode_action(jnp.int32(decision.action))
     x, y = np.asarray(grid.cell_to_world(row, col))
     hand = "open" if aperture == OPEN else "closed"
-    return " | ".join([*parts, f"push {int(state.num_pushes) + 1}: {hand} to x {x:.2f} m, y {y:.2f} m"])
+    return scene, target, f"push {int(state.num_pushes) + 1}: {hand} to x {x:.2f} m, y {y:.2f} m"
 
 
 def _target_name(env: Env, state: EnvState) -> str:

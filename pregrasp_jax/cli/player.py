@@ -102,6 +102,8 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     if trained is None:
         return Player(_make_script(request.policy, env, config), None, env, config)
     q_function = make_q_function(config.network, config.task)
+    if not q_function.fits(trained.params):
+        raise ValueError(f"policy {trained.origin} does not fit its network in this version of the package")
     return Player(
         policies.make_learned(env, q_function.values)(trained.params),
         lambda state: q_function.values(trained.params, state.obs, state.scene.target),

@@ -15,7 +15,7 @@ from pregrasp_jax.drawing.shaded import (
     look_at,
     side_view,
 )
-from pregrasp_jax.drawing.sheets import contact_sheet, make_panel, save_gif, save_png
+from pregrasp_jax.drawing.sheets import contact_sheet, make_panel, make_tiles, save_gif, save_png
 
 __all__ = [
     "OBSTACLE_COLORS",
@@ -30,6 +30,7 @@ __all__ = [
     "instance_colors",
     "look_at",
     "make_panel",
+    "make_tiles",
     "save_gif",
     "save_png",
     "side_view",

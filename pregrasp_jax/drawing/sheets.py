@@ -19,7 +19,7 @@ _INK, _PAPER = (38, 40, 44), (250, 249, 246)
 """Colours of text and background."""
 
 
-def make_panel(
+def make_tiles(
     hulls: HullInstances,
     obs: Observation,
     target_slot: int,
@@ -28,9 +28,8 @@ def make_panel(
     mask: np.ndarray,
     q_values: np.ndarray | None = None,
     action: int | None = None,
-    title: str = "",
-) -> np.ndarray:
-    """Draw scene | height | segmentation | Q closed | Q open, with the half ring and the chosen push.
+) -> list[tuple[str, np.ndarray]]:
+    """Draw scene, height, segmentation, Q closed, Q open, with the half ring and the chosen push.
 
     Args:
         hulls: what stands on the table (unbatched).
@@ -40,10 +39,9 @@ def make_panel(
         mask: [H, W] bool, where it may end.
         q_values: [H, W, 2], or None for a policy without Q-values.
         action: flat index of the chosen push, drawn on the map of its aperture.
-        title: one line above the panel.
 
     Returns:
-        [rows, columns, 3] uint8.
+        (caption, image [rows, columns, 3] uint8) of each.
     """
     push_aperture, push = None, None
     if action is not None:
@@ -60,6 +58,11 @@ def make_panel(
         image = draw_q_map(values[..., aperture], mask, push=chosen, limits=limits, backdrop=np.asarray(obs.height))
         span = "" if q_values is None else f" {limits[0]:.2f} to {limits[1]:.2f}"
         tiles.append((f"{'push' if q_values is None else 'Q'} {name}{span}", image))
+    return tiles
+
+
+def make_panel(tiles: Sequence[tuple[str, np.ndarray]], *, title: str = "") -> np.ndarray:
+    """Return the pictures of `make_tiles` side by side under one line of text, [rows, columns, 3] uint8."""
     return _row(tiles, title=title, footer="maps: seen from above, +x right, +y up")
 
 

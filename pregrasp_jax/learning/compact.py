@@ -8,6 +8,7 @@ Because the window moves with the hand, the network also knows where the hand is
 """
 
 import math
+from typing import NamedTuple
 
 import flax.linen as nn
 import flax.struct as struct
@@ -28,8 +29,8 @@ _BEHIND, _BESIDE, _BEYOND = 16, 4, 24
 objects may be pushed off the table."""
 
 
-class WindowSize(struct.PyTreeNode):
-    """How far a window reaches from the hand, in cells; all of it is static.
+class WindowSize(NamedTuple):
+    """How far a window reaches from the hand, in cells.
 
     Attributes:
         beside: to either side (rows).
@@ -37,9 +38,9 @@ class WindowSize(struct.PyTreeNode):
         ahead: cols with larger x.
     """
 
-    beside: int = struct.field(pytree_node=False)
-    behind: int = struct.field(pytree_node=False)
-    ahead: int = struct.field(pytree_node=False)
+    beside: int
+    behind: int
+    ahead: int
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -24,7 +24,7 @@ _COMPACT_CHANNELS = 128
 
 @dataclass(frozen=True)
 class QFunction:
-    """A network and its input; equal parts make equal functions.
+    """A network and its input.
 
     Attributes:
         network: has ``__call__(inputs) -> [B, H, W, 2]`` and ``q_of_action(inputs, action [B]) -> [B]``.
@@ -39,6 +39,15 @@ class QFunction:
         blank = jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8)
         inputs = self.input_fn(Observation(blank, blank, jnp.zeros(2)), jnp.int32(0))
         return self.network.init(key, jax.tree.map(lambda leaf: leaf[None], inputs))["params"]
+
+    def fits(self, params: Params) -> bool:
+        """Return whether parameters belong to this network."""
+        expected = jax.eval_shape(self.init, jax.random.key(0))
+
+        def shapes(tree: Any) -> Any:
+            return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
+
+        return shapes(params) == shapes(expected)
 
     def apply(self, params: Params, inputs: Any) -> jax.Array:
         """Return the values [B, H, W, 2] of all pushes."""

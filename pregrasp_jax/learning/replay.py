@@ -23,8 +23,8 @@ from pregrasp_jax.types import Observation, Outcome
 MIN_TD_ERROR = 1e-3
 """Added to |TD error|, so that no transition is forgotten because it was once predicted well."""
 
-InputFn = Callable[[Observation, jax.Array], jax.Array]
-"""``(observation, goal slot ()) -> [H, W, 2]`` network input, unbatched."""
+InputFn = Callable[[Observation, jax.Array], Any]
+"""``(observation, goal slot ())`` -> what the network reads, a pytree, unbatched; [H, W, 2] for the paper's."""
 
 
 class Steps(struct.PyTreeNode):
@@ -126,8 +126,8 @@ class Batch(struct.PyTreeNode):
     """B sampled transitions.
 
     Attributes:
-        inputs: [B, H, W, 2] float32 network input before the push, fused for the row's goal.
-        next_inputs: [B, H, W, 2] the same after it.
+        inputs: network input before the push, fused for the row's goal; leading axis B.
+        next_inputs: the same after it.
         action: [B] int32.
         reward: [B] float32.
         terminated: [B] bool.
@@ -137,8 +137,8 @@ class Batch(struct.PyTreeNode):
         rows: [B] int32, for `set_priorities`.
     """
 
-    inputs: jax.Array
-    next_inputs: jax.Array
+    inputs: Any
+    next_inputs: Any
     action: jax.Array
     reward: jax.Array
     terminated: jax.Array
@@ -268,7 +268,7 @@ def sample(
     rows = jax.tree.map(lambda leaf: leaf[slots], replay.rows)
     row, col, _ = grid.decode_action(rows.action)
 
-    def inputs(obs_slots: jax.Array) -> jax.Array:
+    def inputs(obs_slots: jax.Array) -> Any:
         images = jax.tree.map(lambda leaf: leaf[obs_slots], replay.observations)
         return jax.vmap(input_fn)(images, rows.goal)
 

@@ -141,8 +141,11 @@ def make_program(
         config=config.learner,
         replay_config=config.replay,
     )
-    if params is not None:
-        _refuse_misfit(params, q, config)
+    if params is not None and not q.fits(params):
+        raise ValueError(
+            f"the initial parameters are of another network; this run has network.architecture = "
+            f"{config.network.architecture} and network.width = {config.network.width}"
+        )
     return Program(init, collect, make_remember(config.replay), update)
 
 
@@ -152,16 +155,3 @@ def enable_compilation_cache() -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(io.cache_dir() / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
-
-
-def _refuse_misfit(params: Params, q: QFunction, config: Config) -> None:
-    expected = jax.eval_shape(q.init, jax.random.key(0))
-
-    def shapes(tree: Any) -> Any:
-        return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
-
-    if shapes(params) != shapes(expected):
-        raise ValueError(
-            f"the initial parameters are of another network; this run has network.architecture = "
-            f"{config.network.architecture} and network.width = {config.network.width}"
-        )

@@ -1,0 +1,184 @@
+"""The page: sections in the order in which one asks, in one file that needs nothing from anywhere else."""
+
+import datetime
+import importlib.resources
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from pregrasp_jax import io
+from pregrasp_jax.report import charts, results
+from pregrasp_jax.report.films import Film, film_strips
+from pregrasp_jax.report.markup import Markup, code, element, join
+from pregrasp_jax.report.record import SECONDS, RunRecord, is_number
+
+REPORT = "report.html"
+"""Name of the page in its run folder."""
+
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+"""Content security policy: the browser itself refuses scripts and anything from a network."""
+
+_FILM_KEY = (
+    "Before every push: the camera view, what the policy sees (height and segmentation, from above, robot left), and "
+    "its Q-values for a push with the hand closed and open. They are drawn where the push may end, the half ring "
+    "ahead of the hand; the arrow is the push that was chosen."
+)
+
+
+def write_report(
+    run: RunRecord,
+    documents: Sequence[dict[str, Any]] = (),
+    films: Sequence[Film] = (),
+    *,
+    films_note: str = "",
+    path: Path | None = None,
+) -> Path:
+    """Write the report of a run, whole or not at all.
+
+    Args:
+        run: see `read_run`.
+        documents: see `load_evaluations`.
+        films: episodes of the run's policy.
+        films_note: how they were found, or why there are none.
+        path: of the page; `report.html` in the run folder if None.
+
+    Returns:
+        Where it lies.
+    """
+    path = path or run.path / REPORT
+    io.write_bytes(path, build_page(run, documents, films, films_note=films_note).encode())
+    return path
+
+
+def build_page(
+    run: RunRecord, documents: Sequence[dict[str, Any]], films: Sequence[Film], *, films_note: str = ""
+) -> str:
+    """Return the page; see `write_report`."""
+    style = importlib.resources.files("pregrasp_jax.report").joinpath("style.css").read_text()
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", http_equiv="Content-Security-Policy", content=_POLICY),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("meta", name="color-scheme", content="light dark"),
+        element("title", f"{run.name}: report of a run"),
+        element("style", Markup(style)),
+    )
+    sections = [
+        _section("Results", *_results(run, documents)),
+        _section("Learning curves", *_learning(run)),
+        _section("Episodes", *_films(run, films, films_note)),
+        _section("Why episodes fail", *_figures(charts.failure_figures(run, results.of_run(run, documents)))),
+        _section("Where the time went", *_figures(charts.time_figures(run))),
+        _section("Configuration and versions", *_settings(run)),
+    ]
+    body = element("body", element("header", *_header(run)), element("main", *sections))
+    return "<!DOCTYPE html>\n" + element("html", head, body, lang="en") + "\n"
+
+
+def _section(title: str, *content: Markup) -> Markup:
+    return element("section", element("h2", title), "\n", join(content, "\n"))
+
+
+def _header(run: RunRecord) -> Iterator[Markup]:
+    """Yield the name of the run and its numbers."""
+    yield element("h1", run.name)
+    written = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
+    camera, object_set = run.setting("task", "camera", "?"), run.setting("assets", "object_set", "?")
+    text = f"Report of a training run on {object_set} objects, {camera} camera, seed {run.config.get('seed', '?')}."
+    yield element("p", f"{text} Written {written}.", class_="soft")
+    facts = []
+    if is_number(run.best.get("success_rate")):
+        interval = run.best.get("success_ci95") or []
+        between = "95 % interval {} to {}".format(*map(results.percent, interval)) if len(interval) == 2 else ""
+        facts.append(("best validation success", results.percent(run.best["success_rate"]), between))
+        if is_number(run.best.get("env_steps")):
+            facts.append(("reached after", f"{run.best['env_steps']:,} pushes", ""))
+    for metric, title, unit in (("env_steps", "trained for", "pushes"), ("gradient_steps", "updates", "")):
+        if (value := run.last(metric)) is not None:
+            small = f"{run.last('episodes') or 0:,} episodes" if metric == "env_steps" else ""
+            facts.append((title, f"{value:,} {unit}", small))
+    if (seconds := run.last(SECONDS)) is not None:
+        facts.append(("training time", charts.duration(seconds), "without start-up"))
+    fact_list = [
+        element("div", element("dt", title), element("dd", value, element("small", small) if small else ""))
+        for title, value, small in facts
+    ]
+    yield element("dl", *fact_list, class_="facts")
+
+
+def _results(run: RunRecord, documents: Sequence[dict[str, Any]]) -> Iterator[Markup]:
+    if documents:
+        yield results.result_table(run, documents)
+        text = (
+            "Success is a grasp that holds; intervals are Wilson's. Pushes are means over successes, with their "
+            "standard deviation. The last column pairs scene by scene: difference in success with its 95 % interval, "
+            "and McNemar's exact test."
+        )
+        yield element("p", text, class_="soft")
+    else:
+        yield element("p", f"No evaluation of this run was found in its folder {results.EVALUATIONS}.")
+    if lacking := results.missing(run, documents):
+        names = ", ".join(what for what, _ in lacking)
+        commands = [element("pre", code(command)) for _, command in lacking]
+        summary = element("summary", f"Commands that make them ({len(lacking)})")
+        yield element("p", element("strong", "Missing"), f": {names}.")
+        yield element("details", summary, *commands, open=None if documents else "")
+
+
+def _learning(run: RunRecord) -> Iterator[Markup]:
+    if figures := charts.learning_figures(run):
+        text = "Validation plays the averaged network greedily on fixed scenes, grasp included; training explores."
+        yield element("p", text, class_="soft")
+    yield from _figures(figures)
+
+
+def _figures(figures: Sequence[Markup]) -> Iterator[Markup]:
+    if figures:
+        yield element("div", *figures, class_="charts")
+    else:
+        yield element("p", "Nothing has been measured yet: metrics.jsonl has no such row.")
+
+
+def _films(run: RunRecord, films: Sequence[Film], note: str) -> Iterator[Markup]:
+    if films:
+        yield element("p", _FILM_KEY, class_="soft")
+        ramps = [
+            element("span", class_=f"ramp {name}", role="img", aria_label="dark to bright") for name in ("height", "q")
+        ]
+        legend = ["height 0 ", ramps[0], " 0.30 m; Q-values lowest ", ramps[1], " highest (numbers under each map)"]
+        yield element("p", *legend, class_="soft")
+    if note:
+        yield element("p", note)
+    if not films and not note:
+        yield element("p", "No episodes were played. This command plays some and writes the page anew:")
+        yield element("pre", code(f"python -m pregrasp_jax report {run.path}"))
+    yield from film_strips(films)
+
+
+def _settings(run: RunRecord) -> Iterator[Markup]:
+    sessions = run.manifest.get("sessions")
+    latest = sessions[-1] if isinstance(sessions, list) and sessions and isinstance(sessions[-1], dict) else {}
+    count = f"{len(sessions)} session{'s' if len(sessions) > 1 else ''}" if latest and sessions else "no manifest.json"
+    parts = {
+        "Configuration": run.config,
+        f"Versions and machine ({count}, the latest is shown)" if latest else f"Versions ({count})": latest,
+        "Hashes": run.manifest.get("hashes"),
+    }
+    for title, values in parts.items():
+        if isinstance(values, dict) and values:
+            rows = [
+                element("tr", element("th", code(key), scope="row"), element("td", value))
+                for key, value in _flatten(values)
+            ]
+            yield element("details", element("summary", title), element("table", *rows, class_="settings"))
+
+
+def _flatten(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield (dotted key, value as text) of nested settings."""
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from _flatten(value, f"{prefix}{key}.")
+        else:
+            text = ", ".join(map(str, value)) if isinstance(value, list) else "none" if value is None else str(value)
+            yield f"{prefix}{key}", text

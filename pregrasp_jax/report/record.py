@@ -1,0 +1,122 @@
+"""What a run folder holds, read without any of the machinery that made it, so that older runs have reports too."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+import yaml
+
+from pregrasp_jax.report.svg import Point
+
+SECONDS = "time/seconds"
+"""Metric: training time, over all sessions, without start-up and compilation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunRecord:
+    """A run as its files describe it.
+
+    Attributes:
+        path: of the folder.
+        config: content of config.yaml.
+        manifest: content of manifest.json, empty if there is none.
+        metrics: rows of metrics.jsonl; rows of evaluations have `time/seconds` too, from the rows around them.
+        best: what was measured on the validation scenes when the best policy was saved, empty if none was.
+    """
+
+    path: Path
+    config: dict[str, Any]
+    manifest: dict[str, Any]
+    metrics: Sequence[dict[str, Any]]
+    best: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """Name of the folder."""
+        return self.path.resolve().name
+
+    def setting(self, stage: str, name: str, default: Any) -> Any:
+        """Return one setting, or `default` if the run's config.yaml does not have it."""
+        section = self.config.get(stage)
+        return section.get(name, default) if isinstance(section, dict) else default
+
+    def curve(self, y: str, x: str = "env_steps", *, scale: float = 1.0, x_scale: float = 1.0) -> list[Point]:
+        """Return the points (x, y) of all rows that have both as finite numbers."""
+        rows = [row for row in self.metrics if is_number(row.get(x)) and is_number(row.get(y))]
+        return [(row[x] * x_scale, row[y] * scale) for row in rows]
+
+    def last(self, metric: str) -> float | None:
+        """Return the newest finite value of a metric."""
+        return next((row[metric] for row in reversed(self.metrics) if is_number(row.get(metric))), None)
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """Return whether a JSON value is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def read_run(path: Path) -> RunRecord:
+    """Read a run folder; files that a young run does not have yet may be missing.
+
+    Raises:
+        ValueError: no run folder, or one of its files is damaged; one line says which.
+    """
+    config_file = path / "config.yaml"
+    if not config_file.is_file():
+        raise ValueError(f"{path} is not a run folder (it has no config.yaml); wanted the --run-dir of train.py")
+    try:
+        config = yaml.safe_load(config_file.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ValueError(f"{config_file}: {' '.join(str(error).split())}") from None
+    if not isinstance(config, dict):
+        raise ValueError(f"{config_file}: not the settings of a run")
+    return RunRecord(
+        path=path,
+        config=config,
+        manifest=_read_object(path / "manifest.json"),
+        metrics=_with_times(_read_rows(path / "metrics.jsonl")),
+        best=_read_object(path / "best" / "evaluation.json"),
+    )
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    """Return a JSON object, empty if there is no such file."""
+    if not path.exists():
+        return {}
+    try:
+        value = json.loads(path.read_bytes())
+    except ValueError:
+        raise ValueError(f"{path}: damaged, not JSON") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: damaged, not a JSON object")
+    return value
+
+
+def _read_rows(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a JSON lines file; a last line without an end was cut by a crash, and is left out."""
+    text = path.read_bytes().decode(errors="replace") if path.exists() else ""
+    rows = []
+    for index, line in enumerate(text.splitlines(keepends=True), start=1):
+        try:
+            row = json.loads(line)
+        except ValueError:
+            if not line.endswith("\n"):
+                break
+            raise ValueError(f"{path}: line {index} is damaged, not JSON") from None
+        if not isinstance(row, dict) or not is_number(row.get("env_steps")):
+            raise ValueError(f"{path}: line {index} is damaged, it has no env_steps")
+        rows.append(row)
+    return rows
+
+
+def _with_times(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows of which those without a training time have that of their env steps."""
+    known = sorted((row["env_steps"], row[SECONDS]) for row in rows if is_number(row.get(SECONDS)))
+    if not known:
+        return rows
+    steps, seconds = zip(*known, strict=True)
+    return [{SECONDS: float(np.interp(row["env_steps"], steps, seconds)), **row} for row in rows]

@@ -1,0 +1,169 @@
+"""The result table: a run beside the scripts, with intervals, and paired with it where scenes are the same."""
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pregrasp_jax.config import Config, TaskConfig
+from pregrasp_jax.evaluation import load_evaluation
+from pregrasp_jax.report.markup import Markup, element
+from pregrasp_jax.report.record import RunRecord, is_number
+from pregrasp_jax.report.svg import interval_mark
+from pregrasp_jax.statistics import compare
+
+BASELINES = ("random", "straight", "clear", "lookahead")
+"""Scripts that a run is compared with."""
+
+EVALUATIONS = "evaluations"
+"""Subfolder of a run in which evaluation files are looked for."""
+
+_EPISODES = 100
+"""Scenes of an evaluation that the report asks for, if it knows none."""
+
+_TEXTS = ("policy", "object_set", "camera", "physics", "hull_bank_hash", "scene_bank_hash")
+
+_HEADER = (
+    "policy",
+    "objects",
+    "camera",
+    "scenes",
+    "success",
+    "95 % interval",
+    "",
+    "pushes per success",
+    "this run minus it",
+)
+
+
+def load_evaluations(run: RunRecord, files: Sequence[Path] = ()) -> list[dict[str, Any]]:
+    """Read evaluation files, by default those in the `evaluations` folder of the run.
+
+    Returns:
+        The documents by object set, in each the run first, then the scripts, then others.
+
+    Raises:
+        ValueError: one is missing, damaged, or not written by `evaluate.py --json`.
+    """
+    files = files or sorted((run.path / EVALUATIONS).glob("*.json"))
+    documents = [_checked(load_evaluation(file), file) for file in files]
+    return sorted(documents, key=lambda document: (document["object_set"], _rank(run, document)))
+
+
+def is_of_run(run: RunRecord, document: dict[str, Any]) -> bool:
+    """Return whether a run's policy was evaluated: it goes by the folder's name, wherever that was then."""
+    return document["policy"] not in BASELINES and Path(document["policy"]).name == run.name
+
+
+def of_run(run: RunRecord, documents: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the evaluations of this run."""
+    return [document for document in documents if is_of_run(run, document)]
+
+
+def result_table(run: RunRecord, documents: Sequence[dict[str, Any]]) -> Markup:
+    """Return the table of evaluations."""
+    head = element("tr", *(element("th", name, scope="col") for name in _HEADER))
+    rows = [_row(run, document, of_run(run, documents)) for document in documents]
+    table = element("table", element("thead", head), element("tbody", *rows))
+    return element("div", table, class_="scroll", tabindex="0", role="region", aria_label="results")
+
+
+def missing(run: RunRecord, documents: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
+    """Return what the table lacks, as (what, the command that makes it)."""
+    sets = {document["object_set"] for document in documents} or {run.setting("assets", "object_set", "seen")}
+    episodes = max((document["episodes"] for document in documents), default=_EPISODES)
+    lacking = []
+    for object_set in sorted(sets):
+        present = [document for document in documents if document["object_set"] == object_set]
+        names = {document["policy"] for document in present}
+        if not of_run(run, present):
+            lacking.append((f"this run on {object_set} objects", _command(run, str(run.path), object_set, episodes)))
+        lacking += [
+            (f"{name} on {object_set} objects", _command(run, name, object_set, episodes))
+            for name in BASELINES
+            if name not in names
+        ]
+    return lacking
+
+
+def percent(rate: float) -> str:
+    """Return a rate in percent; one decimal, if it has one."""
+    return f"{100 * rate:.1f}".removesuffix(".0") + " %"
+
+
+def _command(run: RunRecord, policy: str, object_set: str, episodes: int) -> str:
+    """Return the line that makes an evaluation of the run's task and puts it where the report looks."""
+    name = object_set + "-" + (policy if policy in BASELINES else "run")
+    arguments = ["--policy", policy, "--object-set", object_set, "--episodes", str(episodes)]
+    if object_dir := run.setting("assets", "object_dir", None):
+        arguments += ["--object-dir", str(object_dir)]
+    radius = run.setting("task", "r_out", Config().task.r_out)
+    if policy in BASELINES and radius != TaskConfig().r_out:
+        arguments += ["--r-out", str(radius)]
+    return shlex.join(["python", "evaluate.py", *arguments, "--json", str(run.path / EVALUATIONS / f"{name}.json")])
+
+
+def _row(run: RunRecord, document: dict[str, Any], of_this_run: Sequence[dict[str, Any]]) -> Markup:
+    low, high = document["success_ci95"]
+    own = is_of_run(run, document)
+    name = element("strong", f"this run ({document['policy']})") if own else document["policy"]
+    cells = [
+        document["object_set"],
+        document["camera"],
+        str(document["episodes"]),
+        percent(document["success_rate"]),
+        f"{percent(low)} to {percent(high)}",
+        interval_mark(document["success_rate"], low, high),
+        _motions(document),
+        "" if own else _paired(of_this_run, document),
+    ]
+    return element(
+        "tr", element("th", name, scope="row"), *(element("td", cell) for cell in cells), class_="own" if own else None
+    )
+
+
+def _motions(document: dict[str, Any]) -> str:
+    mean, std = document["mean_motions"], document["std_motions"]
+    return "no success" if mean is None else f"{mean:.2f} ± {std:.2f}"
+
+
+def _paired(of_this_run: Sequence[dict[str, Any]], other: dict[str, Any]) -> str:
+    """Return the difference in points of the first evaluation of the run on the very same scenes."""
+    for document in of_this_run:
+        try:
+            found = compare(document, other)
+        except ValueError:
+            continue
+        low, high = found.difference_ci95
+        text = f"{100 * found.difference:+.0f} points ({100 * low:+.0f} to {100 * high:+.0f}), p = {found.p_value:.2g}"
+        return text.replace("-", "\N{MINUS SIGN}")
+    return "not on the same scenes" if of_this_run else ""
+
+
+def _rank(run: RunRecord, document: dict[str, Any]) -> tuple[int, str]:
+    if is_of_run(run, document):
+        return 0, document["camera"]
+    policy = document["policy"]
+    return (1 + BASELINES.index(policy), policy) if policy in BASELINES else (1 + len(BASELINES), policy)
+
+
+def _checked(document: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return an evaluation that has what the report shows.
+
+    Raises:
+        ValueError: it has not.
+    """
+    interval, rows = document.get("success_ci95"), document.get("rows")
+    motions = [document.get("mean_motions"), document.get("std_motions")]
+    good = {key: isinstance(document.get(key), str) for key in _TEXTS}
+    good["episodes"] = isinstance(document.get("episodes"), int) and document["episodes"] > 0
+    good["success_rate"] = is_number(document.get("success_rate"))
+    good["success_ci95"] = isinstance(interval, list) and len(interval) == 2 and all(map(is_number, interval))
+    good["mean_motions"] = motions == [None, None] or all(map(is_number, motions))
+    good["failures"] = isinstance(document.get("failures"), dict)
+    good["rows"] = isinstance(rows, list) and all(
+        isinstance(row, dict) and {"scene", "target", "success"} <= row.keys() for row in rows
+    )
+    if damaged := [key for key, is_good in good.items() if not is_good]:
+        raise ValueError(f"{path}: damaged evaluation ({', '.join(damaged)}); evaluate.py --json writes it anew")
+    return document
