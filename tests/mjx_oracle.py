@@ -62,6 +62,10 @@ class CoarseModel:
             mujoco.mj_step(self.model, data)
         return data.qpos[self.slots.slot_qpos_ids]
 
+    def distance(self, data: mujoco.MjData, names: tuple[str, str]) -> float:
+        """Return the signed distance of two geoms by `mj_geomDistance`."""
+        return mujoco.mj_geomDistance(self.model, data, *(self.model.geom(name).id for name in names), 1.0, None)
+
     def corners(self, data: mujoco.MjData, name: str) -> np.ndarray:
         """Return the corners [n, 3] in the world of a hull or box geom."""
         geom = self.model.geom(name)
@@ -84,9 +88,26 @@ def deepest(contacts: list[tuple]) -> dict[tuple[str, str], Touch]:
     return touches
 
 
+def ways_out(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much [k] and along which normals [k, 3] the hull of points a [n, 3] reaches into that of b [m, 3].
+
+    They are the faces of the Minkowski difference, normals from a to b, the least translation that parts them first;
+    negative where the two are apart.
+    """
+    faces = ConvexHull((a[:, None] - b[None]).reshape(-1, 3)).equations
+    faces = faces[np.argsort(-faces[:, 3])]
+    return -faces[:, 3], faces[:, :3]
+
+
 def least_translation(a: np.ndarray, b: np.ndarray) -> float:
-    """Return how far the hull of points a [n, 3] must move to leave that of b [m, 3]: the nearest face of a - b."""
-    return float(-ConvexHull((a[:, None] - b[None]).reshape(-1, 3)).equations[:, 3].max())
+    """Return how far the hull of points a [n, 3] must move to leave that of b [m, 3]."""
+    return float(ways_out(a, b)[0][0])
+
+
+def margin_of_the_first(depths: np.ndarray, normals: np.ndarray, angle: float) -> float:
+    """Return by how much the first way out is shorter than any other that differs by more than an angle, rad."""
+    other = normals @ normals[0] < np.cos(angle)
+    return float(depths[other].min() - depths[0]) if other.any() else np.inf
 
 
 def overlap_along(a: np.ndarray, b: np.ndarray, normal: np.ndarray) -> float:

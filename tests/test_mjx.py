@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from mjx_oracle import CoarseModel, Touch, deepest, least_translation, overlap_along
+from mjx_oracle import CoarseModel, Touch, deepest, margin_of_the_first, overlap_along, ways_out
 from mujoco import mjx as mujoco_mjx
 
 from pregrasp_jax import primitives
@@ -26,6 +26,15 @@ from pregrasp_jax.types import CLOSED, MAX_HULLS, MAX_OBJECTS, OPEN, SceneParams
 NUM_STATES = 200
 AMPLE = Limits(max_hull_pairs=96, max_robot_pairs=64, max_contact_points=192)
 """Nothing is dropped in the states of these tests."""
+
+ALIKE = np.radians(1.0)
+"""Normals nearer than this are the same."""
+
+EXACT = 1e-6
+"""m; C, which computes in float64, either finds the least translation within this or stops short of it."""
+
+UNIQUE = 4e-5
+"""m; a least translation shorter than all others by more than this is the one, twice the tolerance of distances."""
 
 NUM_SLOTS = 3
 SCENES = ((0, 3, 1), (13, 8, -1))
@@ -83,17 +92,28 @@ def around_the_arm(poses: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 class Pair(NamedTuple):
-    """The deepest contact of one pair of geoms by C and by us (None: no contact), and the exact penetration.
+    """The deepest contact of one pair of geoms by C and by us (None: no contact), and what is exact.
 
-    `least` is the least translation that parts the two, `along` the one along our normal; None where one is round.
+    `least` is the least translation that parts the two, `normal` its direction and `margin` by how much the next one
+    is longer that is more than `ALIKE` away; `along` is the translation along our normal and `reference_along` that
+    along C's. None for planes, and for capsules, of which only `least` is known.
     """
 
     kind: str
     names: tuple[str, str]
     reference: Touch | None
     ours: Touch | None
-    least: float | None
-    along: float | None
+    least: float | None = None
+    normal: np.ndarray | None = None
+    margin: float | None = None
+    along: float | None = None
+    reference_along: float | None = None
+
+    @property
+    def reference_is_exact(self) -> bool:
+        """Whether C found the least translation: its distance, and a normal along which that parts the two."""
+        errors = [self.reference.dist + self.least, (self.reference_along or self.least) - self.least]
+        return bool(np.abs(errors).max() < EXACT)
 
 
 @pytest.fixture(scope="module")
@@ -129,26 +149,33 @@ def pairs(bank, model, oracle, contacts_of) -> list[Pair]:
 
 
 def describe(oracle, state, names, reference, ours) -> Pair:
-    """Classify a pair and add its exact penetration."""
+    """Classify a pair and add what is exact."""
     if "table" in names:
-        return Pair("table", names, reference, ours, None, None)
+        return Pair("table", names, reference, ours)
     if any(oracle.model.geom(name).type[0] == mujoco.mjtGeom.mjGEOM_CAPSULE for name in names):
-        return Pair("capsule", names, reference, ours, None, None)
+        return Pair("capsule", names, reference, ours, -oracle.distance(state, names))
     kind = "hulls" if all(name.startswith("slot") for name in names) else "box"
     a, b = (oracle.corners(state, name) for name in names)
-    along = overlap_along(a, b, ours.normal) if ours else None
-    return Pair(kind, names, reference, ours, least_translation(a, b), along)
+    along, reference_along = (overlap_along(a, b, touch.normal) if touch else None for touch in (ours, reference))
+    depths, normals = ways_out(a, b)
+    margin = margin_of_the_first(depths, normals, ALIKE)
+    return Pair(kind, names, reference, ours, depths[0], normals[0], margin, along, reference_along)
+
+
+def solid(pairs) -> list[Pair]:
+    """Return pairs of hulls and boxes."""
+    return [pair for pair in pairs if pair.normal is not None]
 
 
 def test_the_same_pairs_touch(pairs):
     """All pairs that C finds deeper than 10 um, and none that it does not: no absent hull, no parked slot."""
-    kinds = {"table": 0, "hulls": 0, "box": 0}
+    kinds = {"table": 0, "hulls": 0, "box": 0, "capsule": 0}
     for pair in pairs:
-        if pair.kind in kinds:
-            kinds[pair.kind] += 1
-            if (pair.ours is None) != (pair.reference is None):
-                assert max(touch.dist for touch in pair[2:4] if touch) > -1e-5, pair
-    assert min(kinds.values()) > NUM_STATES
+        kinds[pair.kind] += 1
+        if (pair.ours is None) != (pair.reference is None):
+            assert max(touch.dist for touch in pair[2:4] if touch) > -1e-5, pair
+    assert min(kinds[kind] for kind in ("table", "hulls", "box")) > NUM_STATES
+    assert kinds["capsule"] > 50
 
 
 def test_contacts_with_the_table_agree_with_c(pairs):
@@ -158,25 +185,50 @@ def test_contacts_with_the_table_agree_with_c(pairs):
             np.testing.assert_allclose(pair.ours.normal, pair.reference.normal, atol=1e-6)
 
 
+def test_contacts_with_capsules_agree_with_c(pairs):
+    """With `mj_geomDistance` always, and with C's contacts where those do (48 of 56), also in the normal."""
+    both = [pair for pair in pairs if pair.kind == "capsule" and pair.ours and pair.reference]
+    for pair in both:
+        assert pair.ours.dist == pytest.approx(-pair.least, abs=2e-5), pair
+    exact = [pair for pair in both if pair.reference_is_exact]
+    assert len(exact) > 0.8 * len(both)
+    for pair in exact:
+        assert pair.ours.normal @ pair.reference.normal > np.cos(ALIKE), pair
+
+
 def test_the_least_translation_is_exact(pairs):
     """Distance and normal against the Minkowski difference: 20 um, of which 10 um are the preference for faces."""
-    for pair in pairs:
-        if pair.least is not None and pair.ours:
+    for pair in solid(pairs):
+        if pair.ours:
             assert pair.ours.dist == pytest.approx(-pair.least, abs=2e-5), pair
             assert pair.along == pytest.approx(pair.least, abs=2e-5), pair
 
 
 def test_contacts_of_hulls_agree_with_c_where_c_is_exact(pairs):
-    """C stops before the least translation in some pairs, by up to 1 mm; in the others we agree, also in the normal."""
-    both = [pair for pair in pairs if pair.least is not None and pair.ours and pair.reference]
+    """C stops before the least translation in some pairs, by up to 1 mm; in the others we agree."""
+    both = [pair for pair in solid(pairs) if pair.ours and pair.reference]
     error = np.array([abs(pair.ours.dist - pair.reference.dist) for pair in both])
-    c_error = np.array([abs(pair.reference.dist + pair.least) for pair in both])
-    cosine = np.array([pair.ours.normal @ pair.reference.normal for pair in both])
+    exact = np.array([pair.reference_is_exact for pair in both])
     assert np.percentile(error, 50) < 1e-6
     assert np.percentile(error, 90) < 1e-4
-    assert (c_error < 1e-6).mean() > 0.5
-    assert error[c_error < 1e-6].max() < 2e-5
-    assert (cosine[c_error < 1e-6] > np.cos(np.radians(1.0))).mean() > 0.9
+    assert exact.mean() > 0.5
+    assert error[exact].max() < 2e-5
+
+
+def test_the_normal_is_that_of_the_least_translation_where_there_is_one(pairs):
+    """Within 1 degree of the exact one, and of C's where C is exact, unless another way out is within 40 um.
+
+    C's normal is elsewhere in 255 of 1032 pairs: in 253 of them C is not exact (its distance is short by up to 0.7 mm,
+    or moving along its normal does not part the two), the other 2 are ties.
+    """
+    unique = [pair for pair in solid(pairs) if pair.ours and pair.margin > UNIQUE]
+    exact = [pair for pair in unique if pair.reference and pair.reference_is_exact]
+    assert len(unique) > 0.7 * len(solid(pairs))
+    assert len(exact) > 0.5 * len(unique)
+    for pair in unique:
+        assert pair.ours.normal @ pair.normal > np.cos(ALIKE), pair
+    for pair in exact:
+        assert pair.ours.normal @ pair.reference.normal > np.cos(ALIKE), pair
 
 
 def test_contacts_mix_friction_and_softness_as_c_does(pairs):

@@ -14,12 +14,14 @@ import flax.struct as struct
 import jax
 import jax.numpy as jnp
 from mujoco import mjx
-from mujoco.mjx._src import collision_convex, collision_driver, math, mesh
+from mujoco.mjx._src import collision_driver, math, mesh
 from mujoco.mjx._src.collision_types import ConvexInfo, FunctionKey, GeomInfo
 from mujoco.mjx._src.types import Contact, GeomType
 
+from pregrasp_jax.physics.capsule_hull import capsule_hull
 from pregrasp_jax.physics.hull_table import HullTable
-from pregrasp_jax.physics.separating_axis import hull_hull, spread
+from pregrasp_jax.physics.plane_hull import plane_hull
+from pregrasp_jax.physics.separating_axis import hull_hull
 
 _FAR = 1e6
 """m; absent hulls are this far from everything."""
@@ -160,24 +162,6 @@ def _shape(
         box = mesh.box(info)
         return box, jax.tree.map(lambda _: None, box).replace(pos=0, mat=0, size=0, vert=0, face=0)
     return info, 0
-
-
-def plane_hull(plane: GeomInfo, hull: ConvexInfo) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return dist [4], pos [4, 3] and normal [4, 3] of a hull on a plane: vertices within 1 mm of the lowest, spread.
-
-    Source: agrees with `mjc_PlaneConvex` on the deepest point within 1e-6 m (tests/test_mjx.py).
-    """
-    normal = plane.mat[:, 2]
-    points = hull.pos[None] + hull.vert @ hull.mat.T
-    depth = (plane.pos[None] - points) @ normal
-    chosen, distinct = spread(points, depth, depth > jnp.maximum(0, depth.max() - 1e-3), normal)
-    dist = jnp.where(distinct, -depth[chosen], _NONE)
-    return dist, points[chosen] - 0.5 * dist[:, None] * normal[None], jnp.tile(normal, (4, 1))
-
-
-def capsule_hull(capsule: GeomInfo, hull: ConvexInfo) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return dist [2], pos [2, 3] and normal [2, 3] of a capsule and a hull, by MJX's own test."""
-    return collision_convex._capsule_convex(capsule, hull)
 
 
 _COLLIDERS = {

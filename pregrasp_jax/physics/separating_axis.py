@@ -12,10 +12,12 @@ import jax.numpy as jnp
 from mujoco.mjx._src import collision_convex, math
 from mujoco.mjx._src.collision_types import ConvexInfo
 
+from pregrasp_jax.physics.plane_hull import spread
+
 _NONE = 1.0
 """m; distance of a contact that does not exist, as in MJX."""
 
-_PREFER_FACE = 1e-5
+PREFER_FACE = 1e-5
 """m; an edge pair must separate better than every face by this much, or rounding would flip between the two."""
 
 _PARALLEL = 1e-5
@@ -53,7 +55,7 @@ def hull_hull(a: ConvexInfo, b: ConvexInfo) -> tuple[jax.Array, jax.Array, jax.A
     )
     dist, pos = _clipped(reference, incident, face_gap)
     edge_gap, edge_normal, edge_point = _best_edges(placed_a, placed_b, a.edge, b.edge)
-    is_edge = edge_gap > face_gap + _PREFER_FACE
+    is_edge = edge_gap > face_gap + PREFER_FACE
     dist = jnp.where(is_edge, jnp.where(jnp.arange(4) == 0, edge_gap, _NONE), dist)
     dist = jnp.where(jnp.maximum(face_gap, edge_gap) < 0, dist, _NONE)
     pos = jnp.where(is_edge, edge_point[None], pos) @ b.mat.T + b.pos[None]
@@ -113,18 +115,6 @@ def _clipped(
     dist = jnp.where(missing, jnp.where(jnp.arange(4) == 0, gap, _NONE), dist)
     pos = jnp.where(missing, deepest[None], pos)
     return dist, pos - 0.5 * jnp.minimum(dist, 0.0)[:, None] * normal[None]
-
-
-def spread(points: jax.Array, depth: jax.Array, mask: jax.Array, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return four indices of masked points [n, 3] that span much area, the deepest first, and which are distinct.
-
-    MJX's own choice starts at the first point of the mask, so the points are turned until that is the deepest.
-    """
-    count = len(points)
-    turned = (jnp.arange(count) + jnp.argmax(jnp.where(mask, depth, -jnp.inf))) % count
-    chosen = turned[collision_convex._manifold_points(points[turned], mask[turned], normal)]
-    repeated = jnp.any((chosen[:, None] == chosen[None]) & jnp.tri(4, k=-1, dtype=bool), axis=1)
-    return chosen, mask[chosen] & ~repeated
 
 
 def _best_edges(
