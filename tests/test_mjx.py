@@ -1,28 +1,32 @@
 """The `mjx` engine against C MuJoCo on the same hulls and options, and against exact geometry."""
 
 import dataclasses
-from importlib import metadata
-from typing import NamedTuple
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from mjx_oracle import CoarseModel, Touch, deepest, margin_of_the_first, overlap_along, ways_out
+from mjx_oracle import CoarseModel, deepest, margin_of_the_first, overlap_along, ways_out
 from mujoco import mjx as mujoco_mjx
 
 from pregrasp_jax import primitives
 from pregrasp_jax.assets.bank import select
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import SceneConfig
-from pregrasp_jax.physics import make_engine, mjx, mjx_model, mjx_version
+from pregrasp_jax.physics import make_engine, mjx, mjx_model, mjx_version, warp
 from pregrasp_jax.physics.hull_collision import ContactCounts, Limits, collide
 from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.types import CLOSED, MAX_HULLS, MAX_OBJECTS, OPEN, SceneParams
 
+ROOT = Path(__file__).parent.parent
 NUM_STATES = 200
 AMPLE = Limits(max_hull_pairs=96, max_robot_pairs=64, max_contact_points=192)
 """Nothing is dropped in the states of these tests."""
@@ -101,13 +105,13 @@ class Pair(NamedTuple):
 
     kind: str
     names: tuple[str, str]
-    reference: Touch | None
-    ours: Touch | None
-    least: float | None = None
-    normal: np.ndarray | None = None
-    margin: float | None = None
-    along: float | None = None
-    reference_along: float | None = None
+    reference: Any
+    ours: Any
+    least: Any = None
+    normal: Any = None
+    margin: Any = None
+    along: Any = None
+    reference_along: Any = None
 
     @property
     def reference_is_exact(self) -> bool:
@@ -444,13 +448,40 @@ def test_what_does_not_fit_is_refused_in_one_line(bank):
 
 
 def test_another_mjx_is_refused_by_name():
-    mjx_version.require(metadata.version("mujoco-mjx"))
+    mjx_version.require(mjx_version.installed())
     with pytest.raises(ValueError, match=r"mujoco-mjx 4\.0\.0 is installed; allowed: 3\.17\.0"):
         mjx_version.require("4.0.0")
+    with pytest.raises(ValueError, match=r"mujoco-mjx is not installed; allowed: 3\.17\.0"):
+        mjx_version.require(None)
 
 
 def test_the_engine_is_chosen_by_name(bank):
     assert make_engine("mjx", select(bank, [0, 3])).name == "mjx"
+    with pytest.raises(ValueError, match=r"physics\.engine = 'bullet' does not exist; allowed: native, mjx, warp"):
+        make_engine("bullet", bank)
+
+
+@pytest.mark.parametrize(
+    ("installed", "platform", "said"),
+    [
+        (False, "gpu", r"needs warp-lang: pip install 'pregrasp_jax\[warp\]', and an NVIDIA GPU; allowed here"),
+        (True, "cpu", r"needs an NVIDIA GPU, and jax sees only cpu: pip install 'jax\[cuda12\]'"),
+        (True, "gpu", r"MJX-Warp of mujoco-mjx 3\.17\.0 cannot give every scene its own meshes"),
+    ],
+)
+def test_warp_says_what_is_missing(monkeypatch, bank, installed, platform, said):
+    monkeypatch.setattr(warp.importlib.util, "find_spec", lambda _: object() if installed else None)
+    monkeypatch.setattr(warp.jax, "devices", lambda: [SimpleNamespace(platform=platform)])
+    with pytest.raises(ValueError, match=said) as error:
+        make_engine("warp", bank)
+    assert "\n" not in str(error.value)
+
+
+def test_nothing_is_printed_about_warp():
+    """MJX does when it is imported, which would spoil the JSON of the benchmarks."""
+    code = "from pregrasp_jax.physics import mjx"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert run.stdout == ""
 
 
 @pytest.mark.slow

@@ -322,20 +322,72 @@ def test_tally_keeps_the_reasons_of_the_last_episodes():
         pushes=jnp.int32(0),
         reward=jnp.float32(0),
         explored=jnp.int32(0),
+        overflowed=jnp.int32(0),
         reasons=jnp.zeros(len(REASONS), jnp.int32),
     )
     success, truncated = REASONS.index("target_in_region"), REASONS.index("truncated")
     pushes = [([success, 0, truncated], [1, 0, 1]), ([0, success, success], [0, 1, 1]), ([truncated, 0, 0], [1, 0, 0])]
     for reason, ended in pushes:
         results: Any = SimpleNamespace(reason=jnp.array(reason), reward=jnp.ones(3))
-        tally = collect._count(tally, results, jnp.array(ended, bool), jnp.array([True, False, False]))
+        random, overflowed = jnp.array([True, False, False]), jnp.array([reason[0] == success, False, True])
+        tally = collect._count(tally, results, jnp.array(ended, bool), random, overflowed)
     report = collect.report(tally)
     assert report["train/success_rate"] == 0.5, "the first success has left the window of four"
     assert (report["episodes"], report["env_steps"]) == (5, 9)
     assert (report["reasons/target_in_region"], report["reasons/truncated"]) == (3, 2)
     assert report["train/explored"] == pytest.approx(1 / 3) and report["train/episode_length"] == pytest.approx(9 / 5)
+    assert report["physics/overflows"] == 4, "one in the first scene, three in the last"
     fresh = collect.report(tally.begin_report())
+    assert fresh["physics/overflows"] == 0
     assert fresh["train/success_rate"] == 0.5 and fresh["train/reward"] is None and fresh["episodes"] == 5
+
+
+@dataclasses.dataclass(frozen=True)
+class CountingEnv(PictureEnv):
+    """Notes every trace of a push; a physics engine takes seconds to trace. All are short of contacts."""
+
+    traces: list[int] = dataclasses.field(default_factory=list)
+
+    def step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, StepResult]:
+        self.traces.append(1)
+        next_state, result = super().step(state, action)
+        seen = state.physics_obs
+        return next_state.replace(physics_obs=seen.replace(overflows=seen.overflows + 5)), result
+
+
+def test_a_push_is_traced_once_for_shapes_start_and_compilation_and_its_overflows_are_counted():
+    config, env = make_config(), CountingEnv()
+    q_function = QFunction(TinyNetwork(width=config.network.width), input_fn)
+    built = program.make_program(env, config, q_function=q_function)
+    built.shapes()
+    state = jax.jit(built.init)(jax.random.key(0))
+    compiled, _ = built.compile(state)
+    params = state.learning.learner.params
+    actors, _ = compiled.collect(state.actors, params)
+    actors, _ = compiled.collect(actors, params)
+    assert len(env.traces) == 1
+    assert collect.report(actors.tally)["physics/overflows"] == 2 * config.train.num_envs
+
+
+def test_iterations_in_one_program_are_those_of_the_loop():
+    """Pushes, memory and updates, none of which is due in the first; keys and counters to the last bit."""
+    built = make_program(make_config())
+    updates, beta = np.array([0, 2, 1], np.int32), np.array([0.4, 0.5, 0.6], np.float32)
+    start = jax.jit(built.init)(jax.random.key(0))
+    compiled, _ = built.compile(jax.tree.map(jnp.copy, start))
+    state = jax.tree.map(jnp.copy, start)
+    for count, exponent in zip(updates, beta, strict=True):
+        actors, experience = compiled.collect(state.actors, state.learning.learner.params)
+        learning = compiled.remember(state.learning, experience)
+        for _ in range(count):
+            learning = compiled.update(learning, exponent)
+        state = program.TrainState(actors, learning)
+    together = jax.jit(program.make_iterate(built), donate_argnums=0)(start, updates, beta)
+    assert all(leaf.is_deleted() for leaf in jax.tree.leaves(start.learning.replay.observations))
+    for expected, got in zip(jax.tree.leaves(state), jax.tree.leaves(together), strict=True):
+        if jnp.issubdtype(expected.dtype, jax.dtypes.prng_key):
+            expected, got = jax.random.key_data(expected), jax.random.key_data(got)
+        np.testing.assert_allclose(got, expected, rtol=2e-4, atol=1e-6)
 
 
 def test_a_scene_that_ended_starts_anew_and_the_others_go_on():

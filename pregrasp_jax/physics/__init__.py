@@ -9,7 +9,7 @@ def make_engine(name: str, bank: HullBank, *, threads: int = 0) -> Engine:
     """Return the engine called `name` with the objects of `bank`.
 
     Args:
-        name: `native` or `mjx`.
+        name: `native`, `mjx` or `warp`.
         bank: host hull bank.
         threads: of the native engine; 0 takes every core.
 
@@ -22,4 +22,8 @@ def make_engine(name: str, bank: HullBank, *, threads: int = 0) -> Engine:
         from pregrasp_jax.physics import mjx  # imported late: MJX takes seconds to import
 
         return mjx.make_engine(bank)
-    raise ValueError(f"physics.engine = {name!r} is not available; allowed: native, mjx")
+    if name == "warp":
+        from pregrasp_jax.physics import warp
+
+        warp.make_engine()
+    raise ValueError(f"physics.engine = {name!r} does not exist; allowed: native, mjx, warp")

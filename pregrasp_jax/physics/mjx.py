@@ -113,7 +113,8 @@ def make_engine(
     def observe(state: MjxState) -> PhysicsObservation:
         poses = parked.at[:num_slots].set(state.qpos[model.qpos_ids])
         joint_pos = state.qpos[joint_ids]
-        return PhysicsObservation(poses, joint_pos, grasp_pose(joint_pos[:6]), state.diverged)
+        overflows = state.pair_overflows + state.contact_overflows
+        return PhysicsObservation(poses, joint_pos, grasp_pose(joint_pos[:6]), state.diverged, overflows)
 
     return Engine("mjx", init, reset, run, observe)
 

@@ -212,6 +212,7 @@ def make_engine(bank: HullBank, *, threads: int = 0) -> Engine:
         return callback(host_run, shapes, state, ctrl, num_ctrl)
 
     def observe(state: NativeState) -> PhysicsObservation:
-        return PhysicsObservation(state.object_poses, state.joint_pos, grasp_pose(state.joint_pos[:6]), state.diverged)
+        hand_pose = grasp_pose(state.joint_pos[:6])
+        return PhysicsObservation(state.object_poses, state.joint_pos, hand_pose, state.diverged, jnp.int32(0))
 
     return Engine("native", init, reset, run, observe)

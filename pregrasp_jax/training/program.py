@@ -113,7 +113,8 @@ def make_program(
     """
     q = q_function or make_q_function(config.network, config.task)
     optimizer = make_optimizer(config.learner)
-    collect = make_collect(env, q.apply, q.input_fn, config.exploration, warmup=config.learner.warmup)
+    # Under jit, so that shapes, start and compilation share one trace: that of a physics engine takes seconds.
+    collect = jax.jit(make_collect(env, q.apply, q.input_fn, config.exploration, warmup=config.learner.warmup))
 
     def init(key: jax.Array) -> TrainState:
         network_key, actor_key, learner_key = jax.random.split(key, 3)
@@ -147,6 +148,31 @@ def make_program(
             f"{config.network.architecture} and network.width = {config.network.width}"
         )
     return Program(init, collect, make_remember(config.replay), update)
+
+
+IterateFn = Callable[[TrainState, Any, Any], TrainState]
+"""``(state, updates [K] int32, beta [K] float32) -> state`` after K iterations, with so many updates in each."""
+
+
+def make_iterate(program: Program) -> IterateFn:
+    """Return K iterations as one function: push in every scene, remember, update; donate the state.
+
+    Nothing passes through the host, so this is for engines that run on the device, and for accelerators: inside a
+    loop of XLA's CPU compiler an update takes several times as long. Counts are as in `Trainer`, which the host knows.
+    """
+
+    def iteration(state: TrainState, due: tuple[jax.Array, jax.Array]) -> tuple[TrainState, None]:
+        updates, beta = due
+        actors, experience = program.collect(state.actors, state.learning.learner.params)
+        learning = program.remember(state.learning, experience)
+        updates = jnp.where(learning.replay.num_alive > 0, updates, 0)
+        learning = jax.lax.fori_loop(0, updates, lambda _, learning: program.update(learning, beta), learning)
+        return TrainState(actors, learning), None
+
+    def iterate(state: TrainState, updates: Any, beta: Any) -> TrainState:
+        return jax.lax.scan(iteration, state, (jnp.asarray(updates), jnp.asarray(beta)))[0]
+
+    return iterate
 
 
 def enable_compilation_cache() -> None:
