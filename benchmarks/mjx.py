@@ -8,6 +8,7 @@ object has a mesh of its own (stock MJX cannot change it per scene); both get ev
 """
 
 import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
+from pregrasp_jax.physics import mjx_version  # noqa: F401  (imports MJX without its print about Warp)
 
 # isort: split
 import argparse

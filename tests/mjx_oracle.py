@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from pregrasp_jax.physics.base import CTRL_DT
+from pregrasp_jax.physics.mjx_model import make_reference_model
 from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene import model as slot_model
 from pregrasp_jax.types import MAX_OBJECTS, HullBank
@@ -24,12 +25,9 @@ class Touch(NamedTuple):
 class CoarseModel:
     """The native slot model of coarse hulls with MJX's solver options, filled with one scene at a time."""
 
-    def __init__(self, bank: HullBank, options: mujoco.MjModel):
-        self.slots = slot_model.make_slot_model(robot.load_spec(), bank.replace(full=bank.coarse))
+    def __init__(self, bank: HullBank):
+        self.slots = make_reference_model(bank)
         self.model = copy.copy(self.slots.mj_model)
-        for name in ("cone", "impratio", "solver", "iterations", "ls_iterations", "jacobian"):
-            setattr(self.model.opt, name, getattr(options.opt, name))
-        self.model.geom_condim[:] = 3
 
     def fill(self, object_ids: np.ndarray, poses: np.ndarray) -> mujoco.MjData:
         """Return data with objects [<= MAX_OBJECTS] at poses and the robot at the start."""

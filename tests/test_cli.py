@@ -107,6 +107,7 @@ def test_evaluate_py_refuses_what_it_cannot_parse(run: Any, requests: list, argu
         (["--policy", "clear", "--num-envs", "-1"], "num_envs = -1 is out of range"),
         (["--policy", "clear", "--r-out", "0.01"], "task.r_in = 0.04 must be below task.r_out = 0.01"),
         (["--policy", "clear", "--physics.threads", "-3"], "physics.threads = -3 is out of range"),
+        (["--policy", "clear", "--physics.engine", "warp"], "physics.engine = 'warp'"),
         (["--policy", "clear", "--json", "."], ". is a folder; wanted the name of a file"),
         (["--policy", "clear", "--video", "v.gif", "--video-episodes", "0"], "video_episodes = 0 is out of range"),
     ],

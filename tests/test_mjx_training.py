@@ -11,12 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_training import TinyNetwork, input_fn
 
 from pregrasp_jax import policies
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import PRESETS, Config, SceneConfig
 from pregrasp_jax.env import Env
 from pregrasp_jax.evaluation import Evaluator
+from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.physics import mjx
 from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene import bank as scene_bank
@@ -60,7 +62,8 @@ def make_env(num_slots: int, scenes: SceneConfig, traces: list[int] | None = Non
 def training() -> Training:
     traces = []
     env = make_env(NUM_SLOTS, SceneConfig(min_objects=2, max_objects=NUM_SLOTS, train_scenes=4), traces)
-    built = program.make_program(env, PRESETS["ci"])
+    q_function = QFunction(TinyNetwork(), input_fn)  # what is compiled here is long enough without a real one
+    built = program.make_program(env, PRESETS["ci"], q_function=q_function)
     before = jax.jit(built.init)(jax.random.key(0))
     updates, beta = np.array([0, 2], np.int32), np.full(2, 0.4, np.float32)
     iterate = jax.jit(program.make_iterate(built)).lower(before, updates, beta).compile()

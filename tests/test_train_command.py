@@ -30,6 +30,7 @@ _spec.loader.exec_module(train)
         ("ci", "--run-dir PATH"),
         ("ci --run-dir {tmp}/new --physics.enginee mjx", "--physics.enginee, mjx (--physics.engine {native,mjx,warp})"),
         ("ci --run-dir {tmp}/new --physics.engine bullet", "Expected one of ('native', 'mjx', 'warp')"),
+        ("ci --run-dir {tmp}/new --physics.engine warp", "physics.engine = 'warp'"),
         ("ci --run-dir {tmp}/new --seed 1.5", "Error parsing --seed"),
         ("ci --run-dir {tmp}/new --replay.hindsight maybe", "'maybe'"),
         ("ci --run-dir {tmp}/new --no-replay.hindsight", "Unrecognized options: --no-replay.hindsight"),

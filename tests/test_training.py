@@ -390,6 +390,15 @@ def test_iterations_in_one_program_are_those_of_the_loop():
         np.testing.assert_allclose(got, expected, rtol=2e-4, atol=1e-6)
 
 
+def test_a_run_of_fused_iterations_measures_what_the_loop_does(tmp_path, finished):
+    """Two pushes of every scene in one program: the same rows, except where float32 adds in another order."""
+    fused = run(tmp_path / "fused", make_config(episodes=24, fused_iterations=2))
+    pairs = list(zip(timeless(finished.folder.path), timeless(fused.folder.path), strict=False))
+    assert len(pairs) > 5
+    for expected, got in pairs:
+        assert got == pytest.approx(expected, rel=1e-3, nan_ok=True)
+
+
 def test_a_scene_that_ended_starts_anew_and_the_others_go_on():
     config = make_config()
     env = PictureEnv()

@@ -84,7 +84,7 @@ def collide(
         if key.types[0] != GeomType.PLANE:
             gap = _gap(boxes, geom)
             name = "hull" if key.types[0] == GeomType.MESH else "robot"
-            overlaps[name] = jnp.maximum(overlaps[name], jnp.sum(gap < 0))
+            overlaps[name] = jnp.maximum(overlaps[name], jnp.sum(gap < 0, dtype=jnp.int32))
             limit = limits.max_hull_pairs if name == "hull" else limits.max_robot_pairs
             gap, chosen = _smallest(gap, min(limit, len(geom)))
             geom = geom[chosen]

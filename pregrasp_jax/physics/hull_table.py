@@ -47,7 +47,7 @@ def make_hull_table(hulls: Hulls) -> HullTable:
         table["edge"].append(_pad(edges[:, :2], num_edges))
         table["edge_face_normal"].append(_pad(normals[edges[:, 2:]], num_edges))
     arrays = {name: np.stack(values) for name, values in table.items()}
-    return HullTable(**{k: jnp.asarray(v, jnp.int32 if k == "edge" else jnp.float32) for k, v in arrays.items()})
+    return HullTable(**{k: jnp.asarray(v, jnp.int32 if k == "edge" else float) for k, v in arrays.items()})
 
 
 def _describe(vertices: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, list[list[int]], np.ndarray, np.ndarray]:

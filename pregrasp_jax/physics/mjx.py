@@ -37,9 +37,9 @@ class MjxState(struct.PyTreeNode):
     """What is integrated, and what happened on the way.
 
     Attributes:
-        qpos: [nq] float32.
-        qvel: [nv] float32.
-        qacc_warmstart: [nv] float32.
+        qpos: [nq] float32 (float64 where jax has x64 on, for comparisons).
+        qvel: [nv].
+        qacc_warmstart: [nv].
         object_ids: [MAX_OBJECTS] int32.
         diverged: () bool; the rest is then the last state before that.
         pair_overflows: () int32 physics steps since the reset in which overlapping pairs were dropped.
@@ -79,9 +79,9 @@ def make_engine(
     template = mjx.make_data(model.mjx_model)
     data = mujoco.MjData(model.mj_model)
     robot.set_home(model.mj_model, data)
-    home_qpos = jnp.asarray(data.qpos, jnp.float32)
+    home_qpos = jnp.asarray(data.qpos, float)
     joint_ids = robot.joint_qpos_ids(model.mj_model)
-    parked = jnp.asarray(parking_poses(), jnp.float32)
+    parked = jnp.asarray(parking_poses(), float)
     zero = jnp.int32(0)
 
     def reset(state: MjxState, scene: SceneParams) -> MjxState:

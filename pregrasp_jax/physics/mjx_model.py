@@ -137,6 +137,18 @@ def set_options(spec: mujoco.MjSpec, limits: Limits | None) -> None:
         geom.condim = 3
 
 
+def make_reference_model(bank: HullBank) -> slot_model.SlotModel:
+    """Return a slot model for C MuJoCo on the hulls and with the options of MJX, to compare the engine with."""
+    model = slot_model.make_slot_model(robot.load_spec(), bank.replace(full=bank.coarse))
+    option = model.mj_model.opt
+    option.cone, option.impratio = mujoco.mjtCone.mjCONE_PYRAMIDAL, 1
+    option.solver, option.jacobian = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtJacobian.mjJAC_DENSE
+    option.iterations, option.ls_iterations = ITERATIONS, LS_ITERATIONS
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    model.mj_model.geom_condim[:] = 3
+    return model
+
+
 def _add_slots(spec: mujoco.MjSpec, bank: HullBank, num_slots: int, num_hulls: int) -> None:
     """Add the slots; their one mesh only tells MJX that they are meshes, its shape is never used."""
     mesh = spec.add_mesh(name="hull")
@@ -173,10 +185,10 @@ def _tabulate(bank: HullBank, hulls: HullTable, num_hulls: int) -> ObjectTable:
         for name, values in rows.items():
             ids = native.slot_body_ids[0] if name in BODY_FIELDS else native.slot_dof_ids[0]
             values.append(getattr(target, name)[ids].copy())
-    arrays = {name: jnp.asarray(np.stack(values), jnp.float32) for name, values in rows.items()}
+    arrays = {name: jnp.asarray(np.stack(values), float) for name, values in rows.items()}
     return ObjectTable(
         hull_ids=jnp.asarray(hull_ids, jnp.int32),
         body={name: arrays[name] for name in BODY_FIELDS},
         dof={name: arrays[name] for name in DOF_FIELDS},
-        geom={name: jnp.asarray(values, jnp.float32) for name, values in geom.items()},
+        geom={name: jnp.asarray(values, float) for name, values in geom.items()},
     )

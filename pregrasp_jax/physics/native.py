@@ -151,14 +151,15 @@ def _from_bits(bits: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(bits).view(np.float64)
 
 
-def make_engine(bank: HullBank, *, threads: int = 0) -> Engine:
+def make_engine(bank: HullBank, *, threads: int = 0, model: SlotModel | None = None) -> Engine:
     """Compile the slot model of `bank` and return the engine; it owns its simulations.
 
     Args:
         bank: host hull bank.
         threads: 0 takes every core; results do not depend on it.
+        model: a slot model of other hulls or options for the same objects.
     """
-    simulations = Simulations(slot_model.make_slot_model(robot.load_spec(), bank), threads=threads)
+    simulations = Simulations(model or slot_model.make_slot_model(robot.load_spec(), bank), threads=threads)
     shapes = NativeState(
         *(
             jax.ShapeDtypeStruct(shape, dtype)  # pyright: ignore[reportArgumentType]
