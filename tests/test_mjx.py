@@ -91,7 +91,7 @@ def test_contacts_with_the_table_agree_with_c(pairs):
 
 
 def test_contacts_with_capsules_agree_with_c(pairs):
-    """With `mj_geomDistance` always, and with C's contacts where those do (48 of 56 in 200 states), in the normal too."""
+    """With `mj_geomDistance` always, and with C's contacts where those do (48 of 56 in 200 states); normals too."""
     both = [pair for pair in pairs if pair.kind == "capsule" and pair.ours and pair.reference]
     for pair in both:
         assert pair.ours.dist == pytest.approx(-pair.least, abs=2e-5), pair

@@ -63,11 +63,16 @@ def training() -> Training:
     traces = []
     env = make_env(NUM_SLOTS, SceneConfig(min_objects=2, max_objects=NUM_SLOTS, train_scenes=4), traces)
     q_function = QFunction(TinyNetwork(), input_fn)  # what is compiled here is long enough without a real one
-    built = program.make_program(env, PRESETS["ci"], q_function=q_function)
+    config = dataclasses.replace(PRESETS["ci"], train=dataclasses.replace(PRESETS["ci"].train, fused_iterations=2))
+    built = program.make_program(env, config, q_function=q_function)
     before = jax.jit(built.init)(jax.random.key(0))
-    updates, beta = np.array([0, 2], np.int32), np.full(2, 0.4, np.float32)
-    iterate = jax.jit(program.make_iterate(built)).lower(before, updates, beta).compile()
-    return Training(iterate, traces, before, iterate(before, updates, beta))
+    iterate = built.compile(before)[0].iterate
+    assert iterate is not None
+    donated = jax.tree.map(jnp.copy, before)
+    after = iterate(donated, np.array([0, 2], np.int32), np.full(2, 0.4, np.float32))
+    assert donated.actors.env_states.physics.qpos.is_deleted()
+    assert donated.learning.replay.observations.height.is_deleted()
+    return Training(iterate, traces, before, after)
 
 
 def test_two_iterations_push_remember_and_update(training):
@@ -88,7 +93,7 @@ def test_a_scene_that_diverges_ends_alone_is_counted_and_starts_anew(training):
     states = training.before.actors.env_states
     broken = states.replace(physics=states.physics.replace(qpos=states.physics.qpos.at[0, -1].set(jnp.nan)))
     state = training.before.replace(actors=training.before.actors.replace(env_states=broken))
-    after = training.iterate(state, np.zeros(2, np.int32), np.zeros(2, np.float32))
+    after = training.iterate(jax.tree.map(jnp.copy, state), np.zeros(2, np.int32), np.zeros(2, np.float32))
     report = collect.report(after.actors.tally)
     assert report["reasons/nan"] == 1 and report["episodes"] >= 1
     recovered, healthy = after.actors.env_states, training.after.actors.env_states

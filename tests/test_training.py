@@ -369,34 +369,16 @@ def test_a_push_is_traced_once_for_shapes_start_and_compilation_and_its_overflow
     assert collect.report(actors.tally)["physics/overflows"] == 2 * config.train.num_envs
 
 
-def test_iterations_in_one_program_are_those_of_the_loop():
-    """Pushes, memory and updates, none of which is due in the first; keys and counters to the last bit."""
-    built = make_program(make_config())
-    updates, beta = np.array([0, 2, 1], np.int32), np.array([0.4, 0.5, 0.6], np.float32)
-    start = jax.jit(built.init)(jax.random.key(0))
-    compiled, _ = built.compile(jax.tree.map(jnp.copy, start))
-    state = jax.tree.map(jnp.copy, start)
-    for count, exponent in zip(updates, beta, strict=True):
-        actors, experience = compiled.collect(state.actors, state.learning.learner.params)
-        learning = compiled.remember(state.learning, experience)
-        for _ in range(count):
-            learning = compiled.update(learning, exponent)
-        state = program.TrainState(actors, learning)
-    together = jax.jit(program.make_iterate(built), donate_argnums=0)(start, updates, beta)
-    assert all(leaf.is_deleted() for leaf in jax.tree.leaves(start.learning.replay.observations))
-    for expected, got in zip(jax.tree.leaves(state), jax.tree.leaves(together), strict=True):
-        if jnp.issubdtype(expected.dtype, jax.dtypes.prng_key):
-            expected, got = jax.random.key_data(expected), jax.random.key_data(got)
-        np.testing.assert_allclose(got, expected, rtol=2e-4, atol=1e-6)
-
-
 def test_a_run_of_fused_iterations_measures_what_the_loop_does(tmp_path, finished):
     """Two pushes of every scene in one program: the same rows, except where float32 adds in another order."""
     fused = run(tmp_path / "fused", make_config(episodes=24, fused_iterations=2))
-    pairs = list(zip(timeless(finished.folder.path), timeless(fused.folder.path), strict=False))
+    logs = [[row for row in timeless(t.folder.path) if "train/loss" in row] for t in (finished, fused)]
+    pairs = list(zip(*logs, strict=False))
     assert len(pairs) > 5
     for expected, got in pairs:
-        assert got == pytest.approx(expected, rel=1e-3, nan_ok=True)
+        assert expected.keys() == got.keys()
+        for name, value in expected.items():
+            assert got[name] == (value if value is None else pytest.approx(value, rel=1e-3, abs=1e-6)), name
 
 
 def test_a_scene_that_ended_starts_anew_and_the_others_go_on():
