@@ -1,6 +1,6 @@
 """Compile seconds and physics steps per second of the mjx engine, and of stock MJX; prints one JSON object.
 
-    python benchmarks/mjx.py --scenes 2 16 64 [--objects 8 --hulls 6] [--compare 6] [--rows 5]
+    python benchmarks/mjx.py [--scenes 2 16 64] [--sizes 8x4 4x1] [--compare 6] [--rows 5]
 
 Scenes are rows of objects beside each other with the hand in front of them, so that contacts exist. `--compare N`
 also runs N objects of one hull each with our collisions and with `mjx.step` on the same solver options, where every
@@ -30,7 +30,7 @@ from pregrasp_jax.physics import mjx, mjx_model
 from pregrasp_jax.physics.hull_collision import Limits
 from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene.model import parking_poses
-from pregrasp_jax.types import MAX_OBJECTS, HullBank, SceneParams
+from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, HullBank, SceneParams
 
 SUBSTEPS = 5
 """Physics steps of a control row."""
@@ -125,23 +125,46 @@ def measure_stock(bank: HullBank, num_scenes: int, rows: int, *, objects: int) -
     return {"engine": "stock", "scenes": num_scenes, "objects": objects, "hulls": 1, **result}
 
 
+def size(text: str) -> tuple[int, int]:
+    """Return (objects, hulls) of a text like 8x4.
+
+    Raises:
+        ArgumentTypeError: it is not like that, or out of range.
+    """
+    objects, _, hulls = text.partition("x")
+    if not (objects.isdecimal() and hulls.isdecimal()) or not (
+        1 <= int(objects) <= MAX_OBJECTS and 1 <= int(hulls) <= MAX_HULLS
+    ):
+        raise argparse.ArgumentTypeError(
+            f"{text!r}; allowed are 1x1 to {MAX_OBJECTS}x{MAX_HULLS}, objects first, then hulls"
+        )
+    return int(objects), int(hulls)
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, nargs="+", default=[2, 16, 64], help="scenes stepped in parallel")
-    parser.add_argument("--objects", type=int, default=MAX_OBJECTS, help="slots of a scene")
-    parser.add_argument("--hulls", type=int, default=6, help="hulls of a slot; objects with more are left out")
+    parser.add_argument(
+        "--sizes",
+        type=size,
+        nargs="+",
+        default=[(8, 4), (4, 1)],
+        metavar="OBJECTSxHULLS",
+        help="slots of a scene and hulls of a slot; objects with more hulls are left out",
+    )
     parser.add_argument("--compare", type=int, help="also compare with stock MJX: this many objects of one hull")
     parser.add_argument("--rows", type=int, default=5, help="control rows (20 ms) of a measurement")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_compilation_cache", False)
     bank = builtin_bank("seen")
     count = (np.asarray(bank.object_hulls) >= 0).sum(axis=1)
-    fitting = select(bank, np.flatnonzero(count <= arguments.hulls))
     rows = []
     for scenes in arguments.scenes:
-        sizes = {"objects": arguments.objects, "hulls": arguments.hulls}
-        rows.append(measure_ours(fitting, scenes, arguments.rows, **sizes, limits=mjx.LIMITS))
+        for objects, hulls in arguments.sizes:
+            fitting = select(bank, np.flatnonzero(count <= hulls))
+            sizes = {"objects": objects, "hulls": hulls}
+            rows.append(measure_ours(fitting, scenes, arguments.rows, **sizes, limits=mjx.LIMITS))
         if arguments.compare:
             single = select(bank, np.flatnonzero(count == 1))
             # As many as stock makes: nothing culled, nothing dropped.
