@@ -34,6 +34,9 @@ NUM_SLOTS = 3
 SCENES = ((0, 3, 1), (13, 8, -1))
 """Object ids of the seen set: a row of three (1, 5 and 1 hulls) and one of two (2 and 1), in front of the hand."""
 
+NEAR = (0.010, 0.003)
+"""m; how far the objects of these may end from where C leaves them, see `test_a_push_moves_objects_as_c_does`."""
+
 ROW_START, ROW_GAP = -0.19, 0.002
 """m; where a row begins, just beyond the closed fingers, and between its objects."""
 
@@ -242,10 +245,12 @@ def pushed(bank, engine, plans):
 
 
 def test_a_push_moves_objects_as_c_does(bank, model, oracle, engine, plans, pushed):
-    """Same hulls and options: final poses within 10 mm of C after pushes that move them by 17 and 47 mm.
+    """Same hulls and options: final poses near those of C after pushes that move them by 17 and 47 mm.
 
-    Pushing a row is unstable: in float32 a shift of 1e-7 m at the start becomes up to 6 mm at the end (C in float64:
-    a shift of 1e-4 m becomes 3 mm), so nearer agreement than that would be luck.
+    How near can be asked, measured with start poses shifted at random: in the row of three, 1e-7 m (the rounding of
+    float32) moves C by 3.0 to 3.6 mm, this engine by up to 6 mm, and by 0.05 mm where jax computes in float64. In the
+    row of two it is C by 2 um, this engine by 0.4 mm, in float64 by 1 um. What is left in float64, 2.6 and 0.8 mm, is
+    not rounding: it comes from other contacts, where C stops short of the least translation.
     """
     *_, after = pushed
     seen = jax.vmap(engine.observe)(after)
@@ -257,7 +262,7 @@ def test_a_push_moves_objects_as_c_does(bank, model, oracle, engine, plans, push
         moved = np.linalg.norm(reference[:count, :2] - poses[:count, :2], axis=1)
         error = np.linalg.norm(np.asarray(seen.object_poses)[i, :count, :3] - reference[:count, :3], axis=1)
         assert moved.min() > 0.01
-        assert error.max() < 0.010, (moved, error)
+        assert error.max() < NEAR[i], (moved, error)
         np.testing.assert_allclose(seen.joint_pos[i], data.qpos[robot.joint_qpos_ids(model.mj_model)], atol=2e-3)
     assert not seen.diverged.any()
     assert not after.pair_overflows.any()
