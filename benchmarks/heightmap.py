@@ -57,7 +57,7 @@ def make_scenes(bank: HullBank, count: int, rng: np.random.Generator) -> tuple[S
     joint_pos = jnp.concatenate([jax.vmap(solve)(hand_pose), jnp.broadcast_to(home[6:], (count, 2))], axis=1)
     assert not np.isnan(joint_pos).any(), "a hand pose is out of reach"
     scene = SceneParams(jnp.asarray(np.stack(ids), jnp.int32), poses, jnp.zeros(count, jnp.int32))
-    return scene, PhysicsObservation(poses, joint_pos, hand_pose, jnp.zeros(count, bool))
+    return scene, PhysicsObservation(poses, joint_pos, hand_pose, jnp.zeros(count, bool), jnp.zeros(count, jnp.int32))
 
 
 def add_mesh(spec: mujoco.MjSpec, name: str, vertices: np.ndarray, faces: np.ndarray, pose: np.ndarray) -> None:

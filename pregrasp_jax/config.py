@@ -169,6 +169,9 @@ class TrainConfig:
     """Env steps between rows of metrics.jsonl."""
     tensorboard: bool = False
     """Write the same numbers for TensorBoard, into the run folder (needs the extra `tensorboard`)."""
+    fused_iterations: int = 0
+    """Pushes of every scene, with their updates, in one compiled program without the host (engine `mjx` on
+    accelerators); everything else happens between two of these. 0 leaves every step to the host."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,6 +251,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "train.checkpoint_minutes": (0.0, 1e6),
     "train.evaluate_every": (0, 1_000_000_000),
     "train.log_every": (1, 1_000_000_000),
+    "train.fused_iterations": (0, 1_000_000),
 }
 
 _CPU = Config(

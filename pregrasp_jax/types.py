@@ -118,12 +118,14 @@ class PhysicsObservation(struct.PyTreeNode):
         joint_pos: [8] float32 rad: six arm joints, left and right finger drive.
         hand_pose: [7] float32 pose of the grasp point frame (x forward, z up) in the world.
         diverged: () bool, NaN or an engine warning.
+        overflows: () int32 physics steps since the reset in which the engine had no room for every contact.
     """
 
     object_poses: jax.Array
     joint_pos: jax.Array
     hand_pose: jax.Array
     diverged: jax.Array
+    overflows: jax.Array
 
 
 class Observation(struct.PyTreeNode):

@@ -70,7 +70,7 @@ class FakeEnv:
             scene=scene,
             scene_index=jnp.asarray(index, jnp.int32),
             physics_obs=PhysicsObservation(
-                jnp.zeros((MAX_OBJECTS, 7)), jnp.zeros(8), jnp.zeros(7), jnp.zeros((), bool)
+                jnp.zeros((MAX_OBJECTS, 7)), jnp.zeros(8), jnp.zeros(7), jnp.zeros((), bool), jnp.int32(0)
             ),
             obs=Observation(blank, blank, jnp.zeros(2)),
             centroids=jnp.asarray(self.scenes.xy)[index],

@@ -62,7 +62,8 @@ def make_scene(key: jax.Array, object_ids: list[int], joints: jax.Array) -> tupl
     # The scene's own poses are decoys: what is drawn is where the physics has put the objects.
     scene = SceneParams(object_ids=jnp.array(object_ids), poses=poses[::-1] + 1.0, target=jnp.int32(0))
     hand = jnp.array([0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0])
-    return scene, PhysicsObservation(object_poses=poses, joint_pos=joints, hand_pose=hand, diverged=jnp.bool(False))
+    nothing = {"diverged": jnp.bool(False), "overflows": jnp.int32(0)}
+    return scene, PhysicsObservation(object_poses=poses, joint_pos=joints, hand_pose=hand, **nothing)
 
 
 def test_scene_hulls_agree_with_mujoco_rays(bank, joints, key):

@@ -27,7 +27,7 @@ from pregrasp_jax.training import collect, learn, resources
 from pregrasp_jax.training.console import describe, format_time
 from pregrasp_jax.training.run_folder import RunFolder, stored_config
 from pregrasp_jax.training.trainer import Trainer
-from pregrasp_jax.types import REASONS
+from pregrasp_jax.types import REASONS, EnvState, StepResult
 
 
 @pytest.fixture(scope="module")
@@ -244,20 +244,62 @@ def test_tally_keeps_the_reasons_of_the_last_episodes():
         pushes=jnp.int32(0),
         reward=jnp.float32(0),
         explored=jnp.int32(0),
+        overflowed=jnp.int32(0),
         reasons=jnp.zeros(len(REASONS), jnp.int32),
     )
     success, truncated = REASONS.index("target_in_region"), REASONS.index("truncated")
     pushes = [([success, 0, truncated], [1, 0, 1]), ([0, success, success], [0, 1, 1]), ([truncated, 0, 0], [1, 0, 0])]
     for reason, ended in pushes:
         results: Any = SimpleNamespace(reason=jnp.array(reason), reward=jnp.ones(3))
-        tally = collect._count(tally, results, jnp.array(ended, bool), jnp.array([True, False, False]))
+        random, overflowed = jnp.array([True, False, False]), jnp.array([reason[0] == success, False, True])
+        tally = collect._count(tally, results, jnp.array(ended, bool), random, overflowed)
     report = collect.report(tally)
     assert report["train/success_rate"] == 0.5, "the first success has left the window of four"
     assert (report["episodes"], report["env_steps"]) == (5, 9)
     assert (report["reasons/target_in_region"], report["reasons/truncated"]) == (3, 2)
     assert report["train/explored"] == pytest.approx(1 / 3) and report["train/episode_length"] == pytest.approx(9 / 5)
+    assert report["physics/overflows"] == 4, "one in the first scene, three in the last"
     fresh = collect.report(tally.begin_report())
+    assert fresh["physics/overflows"] == 0
     assert fresh["train/success_rate"] == 0.5 and fresh["train/reward"] is None and fresh["episodes"] == 5
+
+
+@dataclasses.dataclass(frozen=True)
+class CountingEnv(PictureEnv):
+    """Notes every trace of a push; a physics engine takes seconds to trace. All are short of contacts."""
+
+    traces: list[int] = dataclasses.field(default_factory=list)
+
+    def step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, StepResult]:
+        self.traces.append(1)
+        next_state, result = super().step(state, action)
+        seen = state.physics_obs
+        return next_state.replace(physics_obs=seen.replace(overflows=seen.overflows + 5)), result
+
+
+def test_a_push_is_traced_once_for_shapes_start_and_compilation_and_its_overflows_are_counted():
+    config, env = make_config(), CountingEnv()
+    built = make_program(config, env)
+    built.shapes()
+    state = jax.jit(built.init)(jax.random.key(0))
+    compiled, _ = built.compile(state)
+    params = state.learning.learner.params
+    actors, _ = compiled.collect(state.actors, params)
+    actors, _ = compiled.collect(actors, params)
+    assert len(env.traces) == 1
+    assert collect.report(actors.tally)["physics/overflows"] == 2 * config.train.num_envs
+
+
+def test_a_run_of_fused_iterations_measures_what_the_loop_does(tmp_path, finished):
+    """Two pushes of every scene in one program: the same rows, except where float32 adds in another order."""
+    fused = run(tmp_path / "fused", make_config(episodes=24, fused_iterations=2))
+    logs = [[row for row in timeless(t.folder.path) if "train/loss" in row] for t in (finished, fused)]
+    pairs = list(zip(*logs, strict=False))
+    assert len(pairs) > 5
+    for expected, got in pairs:
+        assert expected.keys() == got.keys()
+        for name, value in expected.items():
+            assert got[name] == (value if value is None else pytest.approx(value, rel=1e-3, abs=1e-6)), name
 
 
 def test_a_scene_that_ended_starts_anew_and_the_others_go_on():

@@ -34,6 +34,7 @@ class Episode:
         motions: executed pushes; one that was refused as unreachable before the hand moved is not a motion.
         return_: sum of rewards, undiscounted.
         seconds: s, time the robot spent on its motions.
+        overflows: physics steps in which the engine had no room for every contact.
     """
 
     scene: int
@@ -42,6 +43,7 @@ class Episode:
     motions: int
     return_: float
     seconds: float
+    overflows: int = 0
 
     @property
     def success(self) -> bool:
@@ -99,6 +101,7 @@ class EvaluationResult:
             "std_motions": float(np.std(motions)) if motions else None,
             "mean_return": sum(episode.return_ for episode in self.episodes) / total,
             "failures": self.failures,
+            "overflows": sum(episode.overflows > 0 for episode in self.episodes),
             "seconds_per_motion": sum(e.seconds for e in self.episodes) / executed if executed else None,
         }
 
@@ -172,6 +175,8 @@ def format_evaluation(document: dict[str, Any]) -> str:
         "mean return": f"{document['mean_return']:.2f}",
         "failures": ", ".join(f"{reason} {count}" for reason, count in document["failures"].items()) or "none",
     }
+    if document.get("overflows"):
+        lines["contacts dropped"] = f"in {document['overflows']} episodes: the limits of the physics engine are too low"
     settings = f"{document['physics']} physics, {document['camera']} camera, seed {document['seed']}"
     rows = [f"  {name:<18}{text}" for name, text in lines.items()]
     return "\n".join([f"{title} ({settings}, {document['wall_seconds']:.0f} s)", *rows])

@@ -140,6 +140,7 @@ class Evaluator:
             motions=int(run.state.num_pushes),
             return_=float(run.return_),
             seconds=float(run.seconds),
+            overflows=int(run.state.physics_obs.overflows),
         )
 
     def _start_one(self, index: jax.Array) -> _Run:

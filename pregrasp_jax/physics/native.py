@@ -151,14 +151,15 @@ def _from_bits(bits: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(bits).view(np.float64)
 
 
-def make_engine(bank: HullBank, *, threads: int = 0) -> Engine:
+def make_engine(bank: HullBank, *, threads: int = 0, model: SlotModel | None = None) -> Engine:
     """Compile the slot model of `bank` and return the engine; it owns its simulations.
 
     Args:
         bank: host hull bank.
         threads: 0 takes every core; results do not depend on it.
+        model: a slot model of other hulls or options for the same objects.
     """
-    simulations = Simulations(slot_model.make_slot_model(robot.load_spec(), bank), threads=threads)
+    simulations = Simulations(model or slot_model.make_slot_model(robot.load_spec(), bank), threads=threads)
     shapes = NativeState(
         *(
             jax.ShapeDtypeStruct(shape, dtype)  # pyright: ignore[reportArgumentType]
@@ -212,6 +213,7 @@ def make_engine(bank: HullBank, *, threads: int = 0) -> Engine:
         return callback(host_run, shapes, state, ctrl, num_ctrl)
 
     def observe(state: NativeState) -> PhysicsObservation:
-        return PhysicsObservation(state.object_poses, state.joint_pos, grasp_pose(state.joint_pos[:6]), state.diverged)
+        hand_pose = grasp_pose(state.joint_pos[:6])
+        return PhysicsObservation(state.object_poses, state.joint_pos, hand_pose, state.diverged, jnp.int32(0))
 
     return Engine("native", init, reset, run, observe)

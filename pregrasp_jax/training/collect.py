@@ -54,6 +54,7 @@ class Tally(struct.PyTreeNode):
         pushes: () int32 since the last report.
         reward: () float32 summed over them.
         explored: () int32 of them were random.
+        overflowed: () int32 pushes since the last report, branches included, in which the engine dropped contacts.
         reasons: [len(REASONS)] int32 why episodes ended since the last report.
     """
 
@@ -63,12 +64,17 @@ class Tally(struct.PyTreeNode):
     pushes: jax.Array
     reward: jax.Array
     explored: jax.Array
+    overflowed: jax.Array
     reasons: jax.Array
 
     def begin_report(self) -> "Tally":
         """Return the tally with the counts since the last report at 0."""
         return self.replace(
-            pushes=jnp.int32(0), reward=jnp.float32(0), explored=jnp.int32(0), reasons=jnp.zeros_like(self.reasons)
+            pushes=jnp.int32(0),
+            reward=jnp.float32(0),
+            explored=jnp.int32(0),
+            overflowed=jnp.int32(0),
+            reasons=jnp.zeros_like(self.reasons),
         )
 
 
@@ -114,6 +120,7 @@ def init_actors(key: jax.Array, env: Environment, num_envs: int) -> Actors:
         pushes=jnp.int32(0),
         reward=jnp.float32(0),
         explored=jnp.int32(0),
+        overflowed=jnp.int32(0),
         reasons=jnp.zeros(len(REASONS), jnp.int32),
     )
     return Actors(jax.vmap(env.reset)(jax.random.split(reset_key, num_envs)), key, tally)
@@ -176,7 +183,8 @@ def make_collect(
         experience = Experience(steps, _eligible(env.bank, starts), jnp.int32(0))
         next_states, results = jax.tree.map(lambda leaf: leaf[:num_envs], (ends, results))
         ended = results.terminated | results.truncated
-        tally = _count(actors.tally, results, ended, random[:, 0])
+        overflowed = ends.physics_obs.overflows > starts.physics_obs.overflows
+        tally = _count(actors.tally, results, ended, random[:, 0], overflowed)
         fresh = jax.vmap(env.reset)(jax.random.split(reset_key, num_envs))
         return Actors(_select(ended, fresh, next_states), key, tally), experience.replace(episodes=tally.episodes)
 
@@ -215,7 +223,7 @@ def _select(ended: jax.Array, fresh: Any, going_on: Any) -> Any:
     return jax.vmap(lambda e, a, b: jax.tree.map(lambda x, y: jnp.where(e, x, y), a, b))(ended, fresh, going_on)
 
 
-def _count(tally: Tally, results: StepResult, ended: jax.Array, random: jax.Array) -> Tally:
+def _count(tally: Tally, results: StepResult, ended: jax.Array, random: jax.Array, overflowed: jax.Array) -> Tally:
     window = tally.recent.shape[0]
     order = jnp.cumsum(ended, dtype=jnp.int32) - 1
     slots = jnp.where(ended, (tally.episodes + order) % window, window)
@@ -226,6 +234,7 @@ def _count(tally: Tally, results: StepResult, ended: jax.Array, random: jax.Arra
         pushes=tally.pushes + ended.shape[0],
         reward=tally.reward + jnp.sum(results.reward),
         explored=tally.explored + jnp.sum(random, dtype=jnp.int32),
+        overflowed=tally.overflowed + jnp.sum(overflowed, dtype=jnp.int32),
         reasons=tally.reasons.at[results.reason].add(ended.astype(jnp.int32)),
     )
 
@@ -242,5 +251,6 @@ def report(tally: Tally) -> dict[str, Any]:
         "train/reward": float(counts.reward / counts.pushes) if counts.pushes else None,
         "train/episode_length": float(counts.pushes / episodes) if episodes else None,
         "train/explored": float(counts.explored / counts.pushes) if counts.pushes else None,
+        "physics/overflows": int(counts.overflowed),
         **{f"reasons/{name}": int(n) for name, n in zip(REASONS, counts.reasons, strict=True) if name != "running"},
     }

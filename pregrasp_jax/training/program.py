@@ -1,5 +1,6 @@
 """The compiled parts of a training and the state that they share."""
 
+import dataclasses
 import os
 import time
 from collections.abc import Callable
@@ -59,6 +60,10 @@ class TrainState(struct.PyTreeNode):
         return Ring(replay.observations, int(replay.observations_written))
 
 
+IterateFn = Callable[[TrainState, Any, Any], TrainState]
+"""``(state, updates [K] int32, beta [K] float32) -> state`` after K iterations, with so many updates in each."""
+
+
 @dataclass(frozen=True)
 class Program:
     """What a training runs.
@@ -68,12 +73,16 @@ class Program:
         collect: pushes once in every scene; donates the actors.
         remember: adds a push of every scene to the memory; donates the learning state.
         update: samples and updates once; donates the learning state.
+        fused_iterations: how many iterations `compile` puts into one program, see `make_iterate`; 0 compiles the parts.
+        iterate: that program.
     """
 
     init: Callable[[jax.Array], TrainState]
     collect: CollectFn
     remember: RememberFn
     update: UpdateFn
+    fused_iterations: int = 0
+    iterate: IterateFn | None = None
 
     def shapes(self) -> TrainState:
         """Return the shapes of the state without making one."""
@@ -85,6 +94,10 @@ class Program:
         Compiled ahead, a function that would need a second trace fails instead of compiling in silence.
         """
         start = time.perf_counter()
+        if self.fused_iterations:
+            due = (jax.ShapeDtypeStruct((self.fused_iterations,), dtype) for dtype in (jnp.int32, jnp.float32))
+            iterate = jax.jit(make_iterate(self), donate_argnums=0).lower(state, *due).compile()
+            return dataclasses.replace(self, iterate=iterate), time.perf_counter() - start
         params = state.learning.learner.params
         collect = jax.jit(self.collect, donate_argnums=0).lower(state.actors, params).compile()
         experience = jax.eval_shape(self.collect, state.actors, params)[1]
@@ -113,7 +126,8 @@ def make_program(
     """
     q = q_function or make_q_function(config.network, config.task)
     optimizer = make_optimizer(config.learner)
-    collect = make_collect(env, q.apply, q.input_fn, config.exploration, warmup=config.learner.warmup)
+    # Under jit, so that shapes, start and compilation share one trace: that of a physics engine takes seconds.
+    collect = jax.jit(make_collect(env, q.apply, q.input_fn, config.exploration, warmup=config.learner.warmup))
 
     def init(key: jax.Array) -> TrainState:
         network_key, actor_key, learner_key = jax.random.split(key, 3)
@@ -146,7 +160,29 @@ def make_program(
             f"the initial parameters (--init-from) are of another network; allowed is network.architecture = "
             f"{config.network.architecture} and network.width = {config.network.width}"
         )
-    return Program(init, collect, make_remember(config.replay, config.task), update)
+    remember = make_remember(config.replay, config.task)
+    return Program(init, collect, remember, update, config.train.fused_iterations)
+
+
+def make_iterate(program: Program) -> IterateFn:
+    """Return K iterations as one function: push in every scene, remember, update; donate the state.
+
+    Nothing passes through the host, so this is for engines that run on the device, and for accelerators: inside a
+    loop of XLA's CPU compiler an update takes several times as long. Counts are as in `Trainer`, which the host knows.
+    """
+
+    def iteration(state: TrainState, due: tuple[jax.Array, jax.Array]) -> tuple[TrainState, None]:
+        updates, beta = due
+        actors, experience = program.collect(state.actors, state.learning.learner.params)
+        learning = program.remember(state.learning, experience)
+        updates = jnp.where(learning.replay.num_alive > 0, updates, 0)
+        learning = jax.lax.fori_loop(0, updates, lambda _, learning: program.update(learning, beta), learning)
+        return TrainState(actors, learning), None
+
+    def iterate(state: TrainState, updates: Any, beta: Any) -> TrainState:
+        return jax.lax.scan(iteration, state, (jnp.asarray(updates), jnp.asarray(beta)))[0]
+
+    return iterate
 
 
 def enable_compilation_cache() -> None:

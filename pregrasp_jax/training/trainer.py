@@ -16,7 +16,7 @@ from pregrasp_jax.config import Config
 from pregrasp_jax.learning.learner import Params
 from pregrasp_jax.training import collect, learn
 from pregrasp_jax.training.console import Console, format_time
-from pregrasp_jax.training.program import Program, TrainState
+from pregrasp_jax.training.program import IterateFn, Program, TrainState
 from pregrasp_jax.training.run_folder import RunFolder
 
 EvaluateFn = Callable[[Params], dict[str, Any]]
@@ -159,27 +159,45 @@ class Trainer:
         return f"interrupted at step {step}; continue with `python train.py resume {path}`"
 
     def _step(self, program: Program) -> None:
+        """Push in every scene and learn from it: once, or as often as the program does without the host."""
+        steps = self.progress.env_steps + self.config.train.num_envs * np.arange(self._iterations + 1)
+        updates = np.diff([learn.num_updates(int(step), self.config.learner) for step in steps])
+        betas = [self._beta(int(step)) for step in steps[1:]]
+        self.progress.env_steps = int(steps[-1])
+        if program.iterate is not None:
+            self._iterate(program.iterate, updates, betas)
+        else:
+            self._push_and_learn(program, updates[0], betas[0])
+
+    def _iterate(self, iterate: IterateFn, updates: np.ndarray, betas: list[float]) -> None:
+        """Run one program of several iterations; all its time counts as collecting."""
+        with self.progress.timed("collect"):
+            self.state = iterate(self.state, updates.astype(np.int32), np.array(betas, np.float32))
+            self.progress.episodes = int(self.state.actors.tally.episodes)
+
+    def _push_and_learn(self, program: Program, updates: int, beta: float) -> None:
         """Push once in every scene and learn from it."""
         progress, state = self.progress, self.state
-        due_before = learn.num_updates(progress.env_steps, self.config.learner)
-        progress.env_steps += self.config.train.num_envs
-        updates = learn.num_updates(progress.env_steps, self.config.learner) - due_before
         with progress.timed("collect"):
             actors, experience = program.collect(state.actors, state.learning.learner.params)
             progress.episodes = int(experience.episodes)
         with progress.timed("learn"):
             learning = program.remember(state.learning, experience)
-            beta = np.float32(self._beta())
             for _ in range(updates if updates and learning.replay.num_alive else 0):
-                learning = program.update(learning, beta)
+                learning = program.update(learning, np.float32(beta))
             jax.block_until_ready(learning.updates)
         self.state = TrainState(actors, learning)
 
-    def _beta(self) -> float:
+    @property
+    def _iterations(self) -> int:
+        """How many pushes of every scene a step is."""
+        return max(1, self.config.train.fused_iterations)
+
+    def _beta(self, env_steps: int) -> float:
         """Return the importance exponent."""
         replay = self.config.replay
         start, steps = replay.importance_exponent, replay.importance_steps
-        return float(exploration.linear_schedule(self.progress.env_steps, start=start, end=1.0, steps=steps))
+        return float(exploration.linear_schedule(env_steps, start=start, end=1.0, steps=steps))
 
     def log(self) -> None:
         """Append a row to metrics.jsonl, show it, and count anew.
@@ -268,7 +286,7 @@ class Trainer:
     def _crossed(self, interval: int) -> bool:
         """Return whether the last step reached a multiple of `interval` env steps (0: never)."""
         now = self.progress.env_steps
-        return interval > 0 and now // interval > (now - self.config.train.num_envs) // interval
+        return interval > 0 and now // interval > (now - self._iterations * self.config.train.num_envs) // interval
 
     def _seconds_left(self, share: float) -> float | None:
         return self.progress.total_seconds * (1 - share) / share if share > 0 else None

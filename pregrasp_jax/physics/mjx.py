@@ -1,0 +1,176 @@
+"""The `mjx` engine: the whole push is one XLA program, and every scene brings its own objects.
+
+Nothing leaves the device: objects are gathered from tables by id, control rows are a `while_loop` that stops with
+the last scene, and scenes that are through, or diverged, keep their state.
+"""
+
+from pregrasp_jax.physics import mjx_version  # noqa: F401  (refuses other releases before their internals are used)
+
+# isort: split
+import flax.struct as struct
+import jax
+import jax.numpy as jnp
+import mujoco
+from mujoco import mjx
+from mujoco.mjx._src import constraint, forward, smooth, solver
+
+from pregrasp_jax.physics.base import CTRL_DT, MAX_SPEED, NUM_CONTROLS, Engine
+from pregrasp_jax.physics.hull_collision import ContactCounts, Limits, collide
+from pregrasp_jax.physics.mjx_model import MjxSlotModel, fill_slots, make_mjx_slot_model
+from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot.kinematics import grasp_pose
+from pregrasp_jax.scene.model import parking_poses
+from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, HullBank, PhysicsObservation, SceneParams
+
+LIMITS = Limits(max_hull_pairs=32, max_robot_pairs=16, max_contact_points=64)
+"""Sizes for 8 slots of 6 hulls. Over 2513 states of pushes through 100 packed scenes of the seen set the 99.9th
+percentiles are 25 hull pairs, 11 robot pairs and 48 contacts (most seen: 25, 12 and 50)."""
+
+MAX_PENETRATION = 0.02
+"""m; a scene in which two bodies overlap deeper than this has diverged."""
+
+MAX_FALL = 0.05
+"""m; an object whose frame is this far below the table has gone through it: diverged."""
+
+
+class MjxState(struct.PyTreeNode):
+    """What is integrated, and what happened on the way.
+
+    Attributes:
+        qpos: [nq] float32 (float64 where jax has x64 on, for comparisons).
+        qvel: [nv].
+        qacc_warmstart: [nv].
+        object_ids: [MAX_OBJECTS] int32.
+        diverged: () bool; the rest is then the last state before that.
+        pair_overflows: () int32 physics steps since the reset in which overlapping pairs were dropped.
+        contact_overflows: () int32 physics steps since the reset in which penetrating contacts were dropped.
+        max_hull_pairs: () int32 most pairs of hulls with overlapping boxes since the reset.
+        max_robot_pairs: () int32 the same for hulls and robot.
+        max_contacts: () int32 most penetrating contacts since the reset.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    qacc_warmstart: jax.Array
+    object_ids: jax.Array
+    diverged: jax.Array
+    pair_overflows: jax.Array
+    contact_overflows: jax.Array
+    max_hull_pairs: jax.Array
+    max_robot_pairs: jax.Array
+    max_contacts: jax.Array
+
+
+def make_engine(
+    bank: HullBank, *, num_slots: int = MAX_OBJECTS, num_hulls: int = MAX_HULLS, limits: Limits = LIMITS
+) -> Engine:
+    """Compile the slot model of `bank` and return the engine.
+
+    Args:
+        bank: host hull bank.
+        num_slots: objects that fit; a scene with an object in a later slot counts as diverged.
+        num_hulls: hulls per slot.
+        limits: sizes of the broadphase.
+
+    Raises:
+        ValueError: the installed MJX is not supported, or an object has more hulls than a slot.
+    """
+    model = make_mjx_slot_model(bank, limits=limits, num_slots=num_slots, num_hulls=num_hulls)
+    template = mjx.make_data(model.mjx_model)
+    data = mujoco.MjData(model.mj_model)
+    robot.set_home(model.mj_model, data)
+    home_qpos = jnp.asarray(data.qpos, float)
+    joint_ids = robot.joint_qpos_ids(model.mj_model)
+    parked = jnp.asarray(parking_poses(), float)
+    zero = jnp.int32(0)
+
+    def reset(state: MjxState, scene: SceneParams) -> MjxState:
+        del state
+        no_slot = jnp.any(scene.object_ids[num_slots:] >= 0)
+        return MjxState(
+            qpos=home_qpos.at[model.qpos_ids].set(scene.poses[:num_slots]),
+            qvel=jnp.zeros(model.mj_model.nv),
+            qacc_warmstart=jnp.zeros(model.mj_model.nv),
+            object_ids=scene.object_ids.astype(jnp.int32),
+            diverged=no_slot | ~jnp.all(jnp.isfinite(scene.poses)),
+            pair_overflows=zero,
+            contact_overflows=zero,
+            max_hull_pairs=zero,
+            max_robot_pairs=zero,
+            max_contacts=zero,
+        )
+
+    def init() -> MjxState:
+        empty = SceneParams(jnp.full(MAX_OBJECTS, -1, jnp.int32), parked, zero)
+        return reset(None, empty)  # pyright: ignore[reportArgumentType]
+
+    def run(state: MjxState, ctrl: jax.Array, num_ctrl: jax.Array) -> MjxState:
+        if ctrl.shape[-1] != NUM_CONTROLS:
+            raise ValueError(f"ctrl must have {NUM_CONTROLS} columns, got {ctrl.shape[-1]}")
+        with jax.numpy_rank_promotion("allow"), jax.default_matmul_precision("highest"):
+            return run_controls(model, template, state, ctrl, num_ctrl)
+
+    def observe(state: MjxState) -> PhysicsObservation:
+        poses = parked.at[:num_slots].set(state.qpos[model.qpos_ids])
+        joint_pos = state.qpos[joint_ids]
+        overflows = state.pair_overflows + state.contact_overflows
+        return PhysicsObservation(poses, joint_pos, grasp_pose(joint_pos[:6]), state.diverged, overflows)
+
+    return Engine("mjx", init, reset, run, observe)
+
+
+def run_controls(
+    model: MjxSlotModel, template: mjx.Data, state: MjxState, ctrl: jax.Array, num_ctrl: jax.Array
+) -> MjxState:
+    """Advance one scene by `num_ctrl` rows of ctrl [T, NUM_CONTROLS]; see `Engine.run`."""
+    m, hull_ids = fill_slots(model, state.object_ids[: model.num_slots])
+    substeps = round(CTRL_DT / float(model.mj_model.opt.timestep))
+    following = jnp.concatenate([ctrl[1:], ctrl[-1:]])
+
+    def not_through(carry: tuple[jax.Array, MjxState]) -> jax.Array:
+        k, state = carry
+        return (k < num_ctrl * substeps) & ~state.diverged
+
+    def body(carry: tuple[jax.Array, MjxState]) -> tuple[jax.Array, MjxState]:
+        k, state = carry
+        row, share = k // substeps, (k % substeps) / substeps
+        d = template.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
+        d = d.replace(ctrl=ctrl[row] + share * (following[row] - ctrl[row]))
+        d, counts = step(m, d, model, hull_ids)
+        return k + 1, guarded(model, state, d, counts)
+
+    return jax.lax.while_loop(not_through, body, (jnp.int32(0), state))[1]
+
+
+def step(m: mjx.Model, d: mjx.Data, model: MjxSlotModel, hull_ids: jax.Array) -> tuple[mjx.Data, ContactCounts]:
+    """Advance one scene by one physics step: `mjx.step` with our collisions, and without cameras and sensors."""
+    for stage in (smooth.kinematics, smooth.com_pos, smooth.tendon, smooth.crb, smooth.factor_m):
+        d = stage(m, d)
+    d, counts = collide(m, d, model.hulls, hull_ids, model.limits)
+    stages = (constraint.make_constraint, smooth.transmission, forward.fwd_velocity, forward.fwd_actuation)
+    for stage in (*stages, forward.fwd_acceleration, solver.solve, forward.implicit):
+        d = stage(m, d)
+    return d, counts
+
+
+def guarded(model: MjxSlotModel, state: MjxState, d: mjx.Data, counts: ContactCounts) -> MjxState:
+    """Return the state after a physics step, or the one before, marked diverged, if the new one makes no sense."""
+    finite = jnp.all(jnp.isfinite(d.qpos)) & jnp.all(jnp.isfinite(d.qvel))
+    slow = jnp.max(jnp.abs(d.qvel)) < MAX_SPEED
+    present = state.object_ids[: model.num_slots] >= 0
+    above = jnp.all(~present | (d.qpos[model.qpos_ids[:, 2]] > -MAX_FALL))
+    fine = finite & slow & above & (counts.depth < MAX_PENETRATION)
+    limits = model.limits
+    too_many_pairs = (counts.hull_pairs > limits.max_hull_pairs) | (counts.robot_pairs > limits.max_robot_pairs)
+    keep = lambda new, old: jnp.where(fine, new, old)  # noqa: E731
+    return state.replace(
+        qpos=keep(d.qpos, state.qpos),
+        qvel=keep(d.qvel, state.qvel),
+        qacc_warmstart=keep(d.qacc_warmstart, state.qacc_warmstart),
+        diverged=~fine,
+        pair_overflows=state.pair_overflows + too_many_pairs,
+        contact_overflows=state.contact_overflows + (counts.contacts > limits.max_contact_points),
+        max_hull_pairs=jnp.maximum(state.max_hull_pairs, counts.hull_pairs),
+        max_robot_pairs=jnp.maximum(state.max_robot_pairs, counts.robot_pairs),
+        max_contacts=jnp.maximum(state.max_contacts, counts.contacts),
+    )
