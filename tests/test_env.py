@@ -418,5 +418,5 @@ def test_settings_that_cannot_work_are_refused(monkeypatch):
         make_env(Config(scene=SceneConfig(test_scenes=3), task=TaskConfig(r_out=0.05)), split="test")
     make_env(Config(scene=SceneConfig(test_scenes=3), task=TaskConfig(r_out=0.06)), split="test")
     monkeypatch.setattr(env_module.scene_bank, "load_or_build", lambda *_, **__: pytest.fail("packed too early"))
-    with pytest.raises(ValueError, match=r"physics\.engine = 'warp' is not available; allowed: native"):
+    with pytest.raises(ValueError, match=r"physics\.engine = 'warp'.*allowed here: native, mjx"):
         make_env(Config(physics=PhysicsConfig(engine="warp")), split="test")

@@ -250,7 +250,7 @@ def test_a_push_moves_objects_as_c_does(bank, model, oracle, engine, plans, push
     How near can be asked, measured with start poses shifted at random: in the row of three, 1e-7 m (the rounding of
     float32) moves C by 3.0 to 3.6 mm, this engine by up to 6 mm, and by 0.05 mm where jax computes in float64. In the
     row of two it is C by 2 um, this engine by 0.4 mm, in float64 by 1 um. What is left in float64, 2.6 and 0.8 mm, is
-    not rounding: it comes from other contacts, where C stops short of the least translation.
+    not rounding; other contacts, where C stops short of the least translation, are the suspect but not isolated.
     """
     *_, after = pushed
     seen = jax.vmap(engine.observe)(after)

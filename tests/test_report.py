@@ -164,7 +164,7 @@ def test_what_is_damaged_is_one_line(run_dir: Path, monkeypatch, capsys, file: s
         (["--films", "-1"], "films = -1 is out of range; allowed is 0 and more"),
         (["--scenes", "0"], "scenes = 0 is out of range; allowed is 1 and more"),
         (["--evaluations", "absent.json"], "absent.json: No such file or directory; wanted a file written by"),
-        (["--html", "."], ". is a folder; wanted the name of a file"),
+        (["--html", "."], ". is a folder; allowed is the name of a file"),
         ([], "is neither a run folder nor a policy folder"),
     ],
 )
