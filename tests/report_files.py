@@ -19,25 +19,17 @@ def log_row(env_steps: int, seconds: float, **values: Any) -> dict[str, Any]:
     return {"env_steps": env_steps, "episodes": env_steps // 4, **ends, **times, **values}
 
 
-EVALUATION = {"episodes": 50, "eval/success_ci95": [0.1, 0.9]}
+def evaluation_row(env_steps: int, seconds: float, success: float, ci95: list[float]) -> dict[str, Any]:
+    times = {"env_steps": env_steps, "episodes": env_steps // 4, "time/seconds": seconds}
+    return times | {"eval/success_rate": success, "eval/success_ci95": ci95}
+
+
 ROWS = [
     log_row(100, 10.0, **{"train/loss": None, "train/success_rate": 0.2, "train/epsilon": 1.0}),
     log_row(200, 30.0, **{"train/loss": 0.5, "train/q_taken": 0.4, "train/target_mean": 0.6}),
-    {
-        "env_steps": 200,
-        "episodes": 50,
-        "time/seconds": 30.0,
-        "eval/success_rate": 0.25,
-        "eval/success_ci95": [0.1, 0.5],
-    },
+    evaluation_row(200, 30.0, 0.25, [0.1, 0.5]),
     log_row(400, 90.0, **{"train/loss": 0.25, "train/q_taken": 0.5, "train/target_mean": 0.5}),
-    {
-        "env_steps": 300,
-        "episodes": 90,
-        "time/seconds": 60.0,
-        "eval/success_rate": 0.75,
-        "eval/success_ci95": [0.5, 0.9],
-    },
+    evaluation_row(300, 60.0, 0.75, [0.5, 0.9]),
 ]
 
 

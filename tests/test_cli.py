@@ -125,12 +125,9 @@ def test_requests_override_the_camera_and_more_episodes_need_more_scenes(fake_wo
     assert fake_world[0].scene.test_scenes == 300
 
 
-def test_pretrained_is_a_policy_or_a_clear_refusal(fake_world: list[Config]) -> None:
-    if player.PRETRAINED.is_dir():
-        assert make_player(EvaluationConfig(policy="pretrained")).q_values is not None
-    else:
-        with pytest.raises(ValueError, match="ships no trained policy"):
-            make_player(EvaluationConfig(policy="pretrained"))
+def test_the_shipped_policy_has_a_name(fake_world: list[Config]) -> None:
+    assert make_player(EvaluationConfig(policy="pretrained")).q_values is not None
+    assert fake_world[0].network.architecture == "compact"
 
 
 def test_a_film_shows_the_episodes_that_are_counted(fake_world: list[Config]) -> None:

@@ -11,9 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from pregrasp_jax import env as env_module
 from pregrasp_jax.assets.catalogue import builtin_bank
-from pregrasp_jax.config import Config, ExplorationConfig, PhysicsConfig, SceneConfig, TaskConfig
+from pregrasp_jax.config import Config, SceneConfig
 from pregrasp_jax.env import Env, make_env, with_task
 from pregrasp_jax.physics import make_engine
 from pregrasp_jax.robot import model as robot
@@ -292,68 +291,6 @@ def test_a_case_is_seen_where_mujoco_sees_it(env, pushes):
     assert seen[50, 1] == 0 and seen[50, 0] == 0, "the open hand does not hide what is between its fingers"
 
 
-@pytest.fixture(scope="module")
-def choosy(env) -> Env:
-    """Few objects are eligible: those that the bank names as targets, and the last, which an id of -1 would mean."""
-    named = np.append(env.scenes.object_ids[np.arange(3), env.scenes.target], len(NAMES) - 1)
-    return dataclasses.replace(env, bank=env.bank.replace(eligible=np.isin(np.arange(len(NAMES)), named)))
-
-
-@pytest.fixture(scope="module")
-def resets(choosy):
-    reset, keys = jax.jit(jax.vmap(choosy.reset)), jax.random.split(jax.random.key(5), 128)
-    return reset(keys), reset(keys)
-
-
-def assert_turned(scenes, scene: SceneParams, index: int, yaw: float) -> None:
-    """Every object of `scene` is the bank's, turned about the centre; empty slots are where they were."""
-    turn, expected = np.zeros(4), scenes.poses[index].astype(np.float64)
-    mujoco.mju_axisAngle2Quat(turn, [0, 0, 1], yaw)
-    for row in np.flatnonzero(scenes.object_ids[index] >= 0):
-        position, quat = np.zeros(3), np.zeros(4)
-        mujoco.mju_rotVecQuat(position, expected[row, :3], turn)
-        mujoco.mju_mulQuat(quat, turn, expected[row, 3:])
-        expected[row] = [*position, *quat]
-    np.testing.assert_array_equal(scene.object_ids, scenes.object_ids[index])
-    np.testing.assert_allclose(scene.poses, expected, atol=2e-6)
-
-
-def test_reset_draws_scene_yaw_and_eligible_target(choosy, resets):
-    scenes, yaws, targets = choosy.scenes, [], set()
-    for state in unstack(resets[0], range(128)).values():
-        index, scene = int(state.scene_index), state.scene
-        far = np.argmax(np.linalg.norm(scenes.poses[index, :, :2], axis=1) * (scenes.object_ids[index] >= 0))
-        yaws.append(np.angle(complex(*scene.poses[far, :2]) / complex(*scenes.poses[index, far, :2])))
-        assert_turned(scenes, scene, index, yaws[-1])
-        np.testing.assert_array_equal(state.physics_obs.object_poses, scene.poses)
-        targets.add((index, int(scene.target)))
-    eligible = (scenes.object_ids >= 0) & np.asarray(choosy.bank.eligible)[scenes.object_ids]
-    assert targets == {(int(i), int(j)) for i, j in np.argwhere(eligible)}, "every eligible target, and no other"
-    assert (scenes.object_ids < 0).any()
-    assert set(np.floor(np.array(yaws) / (np.pi / 4))) == set(range(-4, 4)), "yaws are drawn from the whole circle"
-
-
-def test_reset_is_a_function_of_its_key(resets):
-    jax.tree.map(np.testing.assert_array_equal, *resets)
-    assert len({poses.tobytes() for poses in np.asarray(resets[0].scene.poses)}) == 128
-
-
-def test_a_started_scene_shows_every_object_to_an_open_hand_at_the_start(env):
-    states = unstack(jax.jit(jax.vmap(env.reset_to))(jnp.arange(3)), range(3))
-    for index, state in states.items():
-        assert_turned(env.scenes, state.scene, index, float(env.scenes.yaw[index]))
-        assert state.scene.target == env.scenes.target[index] and state.scene_index == index
-        np.testing.assert_allclose(state.p1, START, atol=1e-7)
-        np.testing.assert_allclose(state.physics_obs.hand_pose, [*START, 0.1, 1, 0, 0, 0], atol=1e-5)
-        assert state.aperture == OPEN and state.num_pushes == 0
-        present = {slot + 1 for slot in range(MAX_OBJECTS) if state.scene.object_ids[slot] >= 0}
-        assert set(np.unique(state.obs.instance_ids)) == {0} | present, "the fingers end 19 mm before the workspace"
-        for slot in present:
-            x, y = np.nonzero(state.obs.instance_ids == slot)[::-1]
-            centre = -0.25 + 0.005 * (np.array([x.mean(), y.mean()]) + 0.5)
-            np.testing.assert_allclose(centre, state.scene.poses[slot - 1, :2], atol=0.02)
-
-
 OTHER_CASES = {
     "truncated": Case(BOTTLE, BLOCK, reason="truncated", reward=0.5),
     "success on the last push": Case(CAN_AT_PALM, BLOCK, reason="target_in_region", reward=2.0),
@@ -405,18 +342,3 @@ def test_action_mask_is_the_ring_of_the_task(env):
         radii = 0.005 * np.hypot(rows - 50, cols - 50)
         np.testing.assert_allclose([radii.min(), radii.max()], ends, atol=1e-6)
         assert cols.min() == (50 if task is env else 10)
-
-
-@pytest.mark.parametrize(("guided", "longest"), [(True, 0.2), (False, np.hypot(0.5, 0.5))])
-def test_pushes_are_planned_as_long_as_exploration_needs_them(guided, longest):
-    config = Config(scene=SceneConfig(test_scenes=3), exploration=ExplorationConfig(guided=guided))
-    assert longest <= make_env(config, split="test").max_distance < longest + 0.2
-
-
-def test_settings_that_cannot_work_are_refused(monkeypatch):
-    with pytest.raises(ValueError, match=r"task\.r_out = 0\.05 leave no cell .*; allowed is a ring"):
-        make_env(Config(scene=SceneConfig(test_scenes=3), task=TaskConfig(r_out=0.05)), split="test")
-    make_env(Config(scene=SceneConfig(test_scenes=3), task=TaskConfig(r_out=0.06)), split="test")
-    monkeypatch.setattr(env_module.scene_bank, "load_or_build", lambda *_, **__: pytest.fail("packed too early"))
-    with pytest.raises(ValueError, match=r"physics\.engine = 'warp'.*allowed here: native, mjx"):
-        make_env(Config(physics=PhysicsConfig(engine="warp")), split="test")

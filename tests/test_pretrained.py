@@ -9,6 +9,7 @@ import numpy as np
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.cli.player import PRETRAINED
+from pregrasp_jax.config import to_dict
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.types import Observation
 
@@ -28,3 +29,6 @@ def test_its_evaluation_is_of_these_objects():
     assert document["hull_bank_hash"] == builtin_bank("seen").content_hash
     assert document["episodes"] == 200 and document["object_set"] == "seen"
     assert document["success_rate"] == np.mean([row["success"] for row in document["rows"]])
+    assert document["policy"] == "pretrained" and len(document["rows"]) == 200
+    trained = to_dict(load_policy(PRETRAINED).config)
+    assert document["config"]["network"] == trained["network"] and document["config"]["task"] == trained["task"]

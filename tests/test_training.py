@@ -23,8 +23,7 @@ from fake_training import (
 from pregrasp_jax.checkpoint import checksum, load_policy
 from pregrasp_jax.config import PRESETS, ExplorationConfig, from_dict, to_dict
 from pregrasp_jax.learning import learner
-from pregrasp_jax.training import collect, learn, resources
-from pregrasp_jax.training.console import describe, format_time
+from pregrasp_jax.training import collect, learn
 from pregrasp_jax.training.run_folder import RunFolder, stored_config
 from pregrasp_jax.training.trainer import Trainer
 from pregrasp_jax.types import REASONS, EnvState, StepResult
@@ -337,39 +336,3 @@ def test_the_learner_measures_what_the_report_prints(monkeypatch):
     shapes = built.shapes()
     jax.eval_shape(built.update, shapes.learning, jnp.float32(0))
     assert measured == set(learn.METRICS)
-
-
-def test_what_a_run_needs_is_estimated(tmp_path, monkeypatch):
-    rest, ring = make_program(make_config()).shapes().split()
-    assert resources.num_bytes(ring) == 70 * (2 * 100 * 100 + 2 * 4)
-    resources.check(rest, ring, tmp_path / "new" / "run")
-    assert not (tmp_path / "new").exists()
-    monkeypatch.setattr(resources, "available_memory", lambda: 10**6)
-    with pytest.raises(ValueError, match=r"needs about 0.5\d GB of memory, 0.00 GB are free; a smaller replay.capac"):
-        resources.check(rest, ring, tmp_path)
-
-
-def test_memory_is_read_from_machine_and_control_group(tmp_path, monkeypatch):
-    monkeypatch.setattr(resources, "_MEMINFO", tmp_path / "meminfo")
-    monkeypatch.setattr(resources, "_CGROUP", tmp_path)
-    assert resources.available_memory() is None
-    (tmp_path / "meminfo").write_text("MemTotal: 900 kB\nMemAvailable:   500 kB\nHugePages_Total:   0\n")
-    (tmp_path / "memory.max").write_text("max\n")
-    (tmp_path / "memory.current").write_text("100\n")
-    assert resources.available_memory() == 500 * 1024
-    (tmp_path / "memory.max").write_text("1000\n")
-    assert resources.available_memory() == 900
-
-
-def test_the_console_line():
-    row = {
-        "env_steps": 3200,
-        "episodes": 991,
-        "train/success_rate": 0.315,
-        "train/epsilon": 0.5,
-        "train/loss": None,
-        "time/env_steps_per_second": 12.34,
-    }
-    line = "step 3200 | episode 991 | success 32 % | epsilon 0.50 | loss ? | 12.3 steps/s | left 1:01:01"
-    assert describe(row, 3661.2) == line
-    assert format_time(None) == "?"

@@ -4,17 +4,17 @@ import dataclasses
 from pathlib import Path
 
 from pregrasp_jax.cli.film import film_episodes
-from pregrasp_jax.cli.player import PRETRAINED, EvaluationConfig, make_player, run_evaluation
+from pregrasp_jax.cli.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.cli.progress import EpisodeProgress
 from pregrasp_jax.config import PRESETS
 from pregrasp_jax.evaluation import format_evaluations
 from pregrasp_jax.training.session import resume, train
 
-_SCRIPTS, _FILMED = ("random", "straight", "clear"), 3
+_SCRIPTS, _SHIPPED, _FILMED = ("random", "straight", "clear"), "pretrained", 3
 
 
 def demo(*, run_dir: Path = Path("runs/demo"), minutes: float = 5.0, episodes: int = 30) -> None:
-    """Train briefly, evaluate beside the scripts (and the shipped policy, if any), and write a film.
+    """Train briefly, evaluate beside the scripts and the shipped policy, and write a film of the latter.
 
     Args:
         run_dir: the training goes here; one that was interrupted goes on, a finished one is used as it is.
@@ -28,9 +28,8 @@ def demo(*, run_dir: Path = Path("runs/demo"), minutes: float = 5.0, episodes: i
     begun = (run_dir / "config.yaml").exists()
     if code := resume(config, run_dir) if begun else train(config, run_dir):
         raise SystemExit(code)
-    shipped = ("pretrained",) if PRETRAINED.is_dir() else ()
     players, documents = {}, []
-    for policy in (*_SCRIPTS, str(run_dir), *shipped):
+    for policy in (*_SCRIPTS, str(run_dir), _SHIPPED):
         request = EvaluationConfig(policy=policy, scene=config.scene, episodes=episodes)
         with EpisodeProgress() as progress:
             progress.say(f"evaluating {policy}")
@@ -38,6 +37,5 @@ def demo(*, run_dir: Path = Path("runs/demo"), minutes: float = 5.0, episodes: i
             documents.append(run_evaluation(request, players[policy], progress=progress))
     print(format_evaluations(documents))
     film = run_dir / "demo.gif"
-    best = "pretrained" if shipped else str(run_dir)
-    film_episodes(film, players[best], episodes=min(_FILMED, episodes), seed=0)
-    print(f"wrote {film}: {best} at work")
+    film_episodes(film, players[_SHIPPED], episodes=min(_FILMED, episodes), seed=0)
+    print(f"wrote {film}: {_SHIPPED} at work")

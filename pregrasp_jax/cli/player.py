@@ -137,8 +137,6 @@ def _load(spec: str) -> Any:
     if spec in policies.SCRIPTS:
         return None
     if spec == "pretrained":
-        if not PRETRAINED.is_dir():
-            raise ValueError("policy pretrained: this version of the package ships no trained policy")
         return load_policy(PRETRAINED)
     if not Path(spec).exists():
         names = ", ".join([*policies.SCRIPTS, "pretrained"])

@@ -8,10 +8,8 @@ import jax
 import jax.numpy as jnp
 from mujoco.mjx._src.collision_types import ConvexInfo, GeomInfo
 
+from pregrasp_jax.physics.plane_hull import NO_CONTACT
 from pregrasp_jax.physics.separating_axis import PREFER_FACE
-
-_NONE = 1.0
-"""m; distance of a contact that does not exist, as in MJX."""
 
 _INSIDE = 1e-5
 """m; nearer than this to the hull, the direction of the closest points is rounding, and the separating axis decides."""
@@ -63,7 +61,7 @@ def capsule_hull(capsule: GeomInfo, hull: ConvexInfo) -> tuple[jax.Array, jax.Ar
     two = above & (normal[0] @ face_normal > _ALIKE) & _distinct(points, ends)
     least = jnp.where(by_face, face_gap, edge_gap)
     gap = jnp.stack([least, jnp.where(two, jnp.maximum(heights[other], least), jnp.inf)])
-    dist = jnp.where(gap < radius, gap - radius, _NONE)
+    dist = jnp.where(gap < radius, gap - radius, NO_CONTACT)
     pos = points + (radius + 0.5 * jnp.minimum(dist, 0.0))[:, None] * normal
     return dist, pos @ hull.mat.T + hull.pos[None], normal @ hull.mat.T
 

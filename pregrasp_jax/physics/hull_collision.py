@@ -20,14 +20,11 @@ from mujoco.mjx._src.types import Contact, GeomType
 
 from pregrasp_jax.physics.capsule_hull import capsule_hull
 from pregrasp_jax.physics.hull_table import HullTable
-from pregrasp_jax.physics.plane_hull import plane_hull
+from pregrasp_jax.physics.plane_hull import NO_CONTACT, plane_hull
 from pregrasp_jax.physics.separating_axis import hull_hull
 
 _FAR = 1e6
 """m; absent hulls are this far from everything."""
-
-_NONE = 1.0
-"""m; distance of a contact that does not exist, as in MJX."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,9 @@ def collide(
         dist, pos, frame = _narrow_phase(m, d, key, geom, hulls, hull_ids)
         repeats = len(dist) // len(geom)
         present = (gap < 0) & ~_absent(m, hull_ids)[geom].any(axis=1)
-        parts.append((jnp.where(jnp.repeat(present, repeats), dist, _NONE), pos, frame, jnp.repeat(geom, repeats, 0)))
+        parts.append(
+            (jnp.where(jnp.repeat(present, repeats), dist, NO_CONTACT), pos, frame, jnp.repeat(geom, repeats, 0))
+        )
     dist, pos, frame, geom = (jnp.concatenate(part) for part in zip(*parts, strict=True))
     count = ContactCounts(
         hull_pairs=overlaps["hull"],

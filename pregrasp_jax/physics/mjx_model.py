@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import dataclass
+from typing import Any
 
 import flax.struct as struct
 import jax
@@ -51,7 +52,6 @@ class MjxSlotModel:
         hulls: all hulls of the bank at the coarse level.
         objects: all objects of the bank.
         limits: sizes of the broadphase.
-        num_slots: objects that fit.
         body_ids: [S] int.
         geom_ids: [S, M] int.
         qpos_ids: [S, 7] int.
@@ -63,11 +63,15 @@ class MjxSlotModel:
     hulls: HullTable
     objects: ObjectTable
     limits: Limits
-    num_slots: int
     body_ids: np.ndarray
     geom_ids: np.ndarray
     qpos_ids: np.ndarray
     dof_ids: np.ndarray
+
+    @property
+    def num_slots(self) -> int:
+        """Objects that fit."""
+        return len(self.body_ids)
 
 
 def make_mjx_slot_model(
@@ -96,7 +100,6 @@ def make_mjx_slot_model(
         hulls=hulls,
         objects=_tabulate(bank, hulls, num_hulls),
         limits=limits,
-        num_slots=num_slots,
         body_ids=np.array([body.id for body in bodies]),
         geom_ids=np.array([body.geomadr[0] + np.arange(num_hulls) for body in bodies]),
         qpos_ids=np.array([mj_model.jnt_qposadr[body.jntadr[0]] + np.arange(7) for body in bodies]),
@@ -125,26 +128,25 @@ def set_options(spec: mujoco.MjSpec, limits: Limits | None) -> None:
     Elliptic cones build a matrix of all constraint rows squared; other contact dimensions would double the groups of
     the hand. Without limits MJX keeps every contact.
     """
-    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    spec.option.impratio = 1
-    spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    spec.option.iterations, spec.option.ls_iterations = ITERATIONS, LS_ITERATIONS
-    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    _choose(spec.option)
     if limits is not None:
         spec.add_numeric(name="max_contact_points", data=[limits.max_contact_points], size=1)
     for geom in spec.geoms:
         geom.condim = 3
 
 
-def make_reference_model(bank: HullBank) -> slot_model.SlotModel:
-    """Return a slot model for C MuJoCo on the hulls and with the options of MJX, to compare the engine with."""
-    model = slot_model.make_slot_model(robot.load_spec(), bank.replace(full=bank.coarse))
-    option = model.mj_model.opt
+def _choose(option: Any) -> None:
+    """Set the solver's options of a spec or of a model."""
     option.cone, option.impratio = mujoco.mjtCone.mjCONE_PYRAMIDAL, 1
     option.solver, option.jacobian = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtJacobian.mjJAC_DENSE
     option.iterations, option.ls_iterations = ITERATIONS, LS_ITERATIONS
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+
+
+def make_reference_model(bank: HullBank) -> slot_model.SlotModel:
+    """Return a slot model for C MuJoCo on the hulls and with the options of MJX, to compare the engine with."""
+    model = slot_model.make_slot_model(robot.load_spec(), bank.replace(full=bank.coarse))
+    _choose(model.mj_model.opt)
     model.mj_model.geom_condim[:] = 3
     return model
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from mujoco.mjx._src import collision_convex
 from mujoco.mjx._src.collision_types import ConvexInfo, GeomInfo
 
-_NONE = 1.0
+NO_CONTACT = 1.0
 """m; distance of a contact that does not exist, as in MJX."""
 
 
@@ -18,7 +18,7 @@ def plane_hull(plane: GeomInfo, hull: ConvexInfo) -> tuple[jax.Array, jax.Array,
     points = hull.pos[None] + hull.vert @ hull.mat.T
     depth = (plane.pos[None] - points) @ normal
     chosen, distinct = spread(points, depth, depth > jnp.maximum(0, depth.max() - 1e-3), normal)
-    dist = jnp.where(distinct, -depth[chosen], _NONE)
+    dist = jnp.where(distinct, -depth[chosen], NO_CONTACT)
     return dist, points[chosen] - 0.5 * dist[:, None] * normal[None], jnp.tile(normal, (4, 1))
 
 

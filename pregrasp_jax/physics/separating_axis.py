@@ -12,10 +12,7 @@ import jax.numpy as jnp
 from mujoco.mjx._src import collision_convex, math
 from mujoco.mjx._src.collision_types import ConvexInfo
 
-from pregrasp_jax.physics.plane_hull import spread
-
-_NONE = 1.0
-"""m; distance of a contact that does not exist, as in MJX."""
+from pregrasp_jax.physics.plane_hull import NO_CONTACT, spread
 
 PREFER_FACE = 1e-5
 """m; an edge pair must separate better than every face by this much, or rounding would flip between the two."""
@@ -56,8 +53,8 @@ def hull_hull(a: ConvexInfo, b: ConvexInfo) -> tuple[jax.Array, jax.Array, jax.A
     dist, pos = _clipped(reference, incident, face_gap)
     edge_gap, edge_normal, edge_point = _best_edges(placed_a, placed_b, a.edge, b.edge)
     is_edge = edge_gap > face_gap + PREFER_FACE
-    dist = jnp.where(is_edge, jnp.where(jnp.arange(4) == 0, edge_gap, _NONE), dist)
-    dist = jnp.where(jnp.maximum(face_gap, edge_gap) < 0, dist, _NONE)
+    dist = jnp.where(is_edge, jnp.where(jnp.arange(4) == 0, edge_gap, NO_CONTACT), dist)
+    dist = jnp.where(jnp.maximum(face_gap, edge_gap) < 0, dist, NO_CONTACT)
     pos = jnp.where(is_edge, edge_point[None], pos) @ b.mat.T + b.pos[None]
     normal = b.mat @ jnp.where(is_edge, edge_normal, normal)
     return dist, pos, jnp.tile(normal, (4, 1))
@@ -109,10 +106,10 @@ def _clipped(
     points, inside = collision_convex._clip(polygon, other, normal, other_normal)
     depth = (polygon[:1] - points) @ normal
     chosen, distinct = spread(points, depth, inside & (depth > 0), normal)
-    dist, pos = jnp.where(distinct, -depth[chosen], _NONE), points[chosen]
+    dist, pos = jnp.where(distinct, -depth[chosen], NO_CONTACT), points[chosen]
     missing = jnp.all(dist >= 0)
     deepest = other[(other @ normal).argmin()]
-    dist = jnp.where(missing, jnp.where(jnp.arange(4) == 0, gap, _NONE), dist)
+    dist = jnp.where(missing, jnp.where(jnp.arange(4) == 0, gap, NO_CONTACT), dist)
     pos = jnp.where(missing, deepest[None], pos)
     return dist, pos - 0.5 * jnp.minimum(dist, 0.0)[:, None] * normal[None]
 
