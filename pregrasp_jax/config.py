@@ -87,6 +87,8 @@ class NetworkConfig:
     """Factor on all channel counts; 1.0 is the paper's 7.4 M parameters, 0.25 has 0.46 M (compact: 0.12 M)."""
     initial_bias: float = 0.0
     """Q-value of every push before training."""
+    mirror: bool = False
+    """Average the values of a scene and of its mirror image, and learn from either at random."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,7 +258,7 @@ _RANGES: dict[str, tuple[float, float]] = {
 
 _CPU = Config(
     scene=SceneConfig(validation_scenes=100),
-    network=NetworkConfig(architecture="compact", width=0.25, initial_bias=0.5),
+    network=NetworkConfig(architecture="compact", width=0.25, initial_bias=0.5, mirror=True),
     replay=ReplayConfig(capacity=100_000, importance_steps=50_000),
     learner=LearnerConfig(
         learning_rate=1e-3, learning_rate_steps=100_000, polyak=0.995, huber_delta=1.0, updates_per_step=2.0

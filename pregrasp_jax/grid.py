@@ -49,6 +49,12 @@ def decode_action(action: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     return cell // GRID_SIZE, cell % GRID_SIZE, aperture
 
 
+def mirror_action(action: jax.Array) -> jax.Array:
+    """Return the flat index of a push reflected in the robot's plane y = 0."""
+    row, col, aperture = decode_action(action)
+    return encode_action(GRID_SIZE - 1 - row, col, aperture)
+
+
 def quantize_height(height: jax.Array) -> jax.Array:
     """Clip heights in m to [0, MAX_HEIGHT] and store them as uint8 (steps of 1.2 mm)."""
     return jnp.round(jnp.clip(height, 0.0, MAX_HEIGHT) * (255 / MAX_HEIGHT)).astype(jnp.uint8)

@@ -1,5 +1,6 @@
 """The compact network: its window, and that values and gradients land where the grid says."""
 
+import dataclasses
 import functools
 
 import jax
@@ -60,7 +61,7 @@ def test_window_is_the_picture_around_the_hand_and_zero_outside(p1):
 def test_window_holds_every_cell_of_the_ring(r_out, full_ring):
     task = TaskConfig(r_out=r_out, full_ring=full_ring)
     size = window_size(task)
-    assert size.shape[0] % PATCH == 0 and size.shape[1] % PATCH == 0
+    assert size.shape[0] % PATCH == 1 and size.shape[1] % PATCH == 0
     for p1 in (START, (0.0025, 0.0025), (0.1975, -0.2475)):
         mask = primitives.half_ring_mask(jnp.array(p1), r_in=task.r_in, r_out=r_out, full_ring=full_ring)
         origin = look_around_hand(observation(p1), jnp.int32(0), size=size).origin
@@ -133,6 +134,43 @@ def test_values_move_with_the_hand_and_the_scene():
     ids = np.roll(ids, (5, -7), axis=(0, 1))
     there = q(Observation(jnp.asarray(30 * ids), jnp.asarray(ids), jnp.array([-0.0875, 0.0225])))
     np.testing.assert_allclose(here[40:60, 45:60], np.asarray(there)[45:65, 38:53], atol=1e-5)
+
+
+@pytest.mark.parametrize("architecture", ["paper", "compact"])
+def test_mirrored_scene_gets_mirrored_values(architecture):
+    """The reflection is made of the observation by hand: rows are y, so they and the hand's y turn around."""
+    obs = observation((-0.1025, 0.0525))
+    reflected = Observation(obs.height[::-1], obs.instance_ids[::-1], obs.p1 * jnp.array([1.0, -1.0]))
+    config = NetworkConfig(architecture=architecture, width=1 / 16, mirror=True)
+    q = make_q_function(config, TaskConfig())
+    params = jax.tree.map(
+        lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(2), leaf.shape), q.init(jax.random.key(0))
+    )
+    alone = dataclasses.replace(q, mirror_fn=None)
+    here, there = (np.asarray(alone.values(params, o, jnp.int32(1))) for o in (obs, reflected))
+    reach = np.s_[20:100, 30:70]  # 0.2 m to both sides of the hand, and ahead: what the half ring may hold
+    assert np.abs(here - there[::-1])[reach].max() > 0.1  # on its own the network is not symmetric
+    found = np.asarray(q.values(params, obs, jnp.int32(1)))
+    np.testing.assert_allclose(found[reach], ((here + there[::-1]) / 2)[reach], rtol=1e-4, atol=1e-4)
+
+
+def test_augmented_pushes_are_those_of_the_scene_or_of_its_mirror_image():
+    q = make_q_function(NetworkConfig(architecture="compact", width=1 / 16, mirror=True), TaskConfig())
+    obs = observation((-0.1025, 0.0525))
+    reflected = Observation(obs.height[::-1], obs.instance_ids[::-1], obs.p1 * jnp.array([1.0, -1.0]))
+    pushes = {False: (obs, 60 * 100 + 40), True: (reflected, 39 * 100 + 40)}  # y = 0.0525 and -0.0525
+    inputs = jax.tree.map(lambda leaf: jnp.stack([leaf] * 64), q.input_fn(obs, jnp.int32(1)))
+    windows, actions = q.augment(jax.random.key(0), inputs, jnp.full(64, 2 * pushes[False][1] + 1))
+    seen = set()
+    for i, action in enumerate(actions.tolist()):
+        mirrored = action // 2 != pushes[False][1]
+        expected, cell = pushes[mirrored]
+        assert action == 2 * cell + 1
+        window = q.input_fn(expected, jnp.int32(1))
+        np.testing.assert_allclose(windows.images[i], window.images, atol=1e-6)
+        np.testing.assert_array_equal(windows.origin[i], window.origin)
+        seen.add(mirrored)
+    assert seen == {False, True}
 
 
 def test_untrained_it_promises_its_bias_everywhere_and_learns_in_every_layer():

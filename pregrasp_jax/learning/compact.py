@@ -45,16 +45,16 @@ class WindowSize(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns, multiples of `PATCH`."""
-        return 2 * self.beside, self.behind + self.ahead
+        """Rows, as many on either side of the hand, and columns."""
+        return 2 * self.beside + 1, self.behind + self.ahead
 
 
 class Window(struct.PyTreeNode):
     """What surrounds the hand.
 
     Attributes:
-        images: [..., R, C, 3] float32: the two images of `heightmap.network_input`, and 1 inside the workspace;
-            all are 0 outside of it.
+        images: [..., R, C, 3] float32, the hand in the middle row: the two images of `heightmap.network_input`, and 1
+            inside the workspace; all are 0 outside of it.
         origin: [..., 2] int32, row and col of the grid where the window begins; may lie outside.
     """
 
@@ -90,6 +90,13 @@ def look_around_hand(obs: Observation, target_slot: jax.Array, *, size: WindowSi
     padded = jnp.pad(images, ((rows, rows), (cols, cols), (0, 0)))
     start = (origin[0] + rows, origin[1] + cols, jnp.int32(0))
     return Window(jax.lax.dynamic_slice(padded, start, (rows, cols, 3)), origin)
+
+
+def mirror_window(window: Window) -> Window:
+    """Reflect the windows of B scenes in the robot's plane y = 0."""
+    rows = window.images.shape[1]
+    row, col = window.origin[:, 0], window.origin[:, 1]
+    return Window(window.images[:, ::-1], jnp.stack([grid.GRID_SIZE - rows - row, col], axis=-1))
 
 
 def paste(q: jax.Array, origin: jax.Array) -> jax.Array:
@@ -137,7 +144,8 @@ class CompactNetwork(nn.Module):
         return jnp.where(inside, taken, 0.0)
 
     def _q_of_window(self, window: Window) -> jax.Array:
-        """Return [B, R, C, 2]."""
+        """Return [B, R - 1, C, 2]: the last row completes no patch, it is there for the mirror image."""
+        window = window.replace(images=window.images[:, :-1])
         x = window.images
         assert x.ndim == 4 and x.shape[-1] == 3, f"expected [B, R, C, 3], got {x.shape}"
         assert x.shape[1] % PATCH == 0 and x.shape[2] % PATCH == 0, f"R and C must be divisible by {PATCH}: {x.shape}"

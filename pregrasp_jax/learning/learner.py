@@ -23,6 +23,9 @@ ApplyFn = Callable[[Params, jax.Array], jax.Array]
 QAtFn = Callable[[Params, jax.Array, jax.Array], jax.Array]
 """``(params, inputs [B, H, W, 2], action [B]) -> q [B]`` of the taken actions."""
 
+AugmentFn = Callable[[jax.Array, Any, jax.Array], tuple[Any, jax.Array]]
+"""``(key, inputs of B scenes, action [B]) -> the same of equivalent scenes``."""
+
 MaskFn = Callable[[jax.Array], jax.Array]
 """``p1 [2] -> [H, W] bool``, the cells where the next push may end."""
 
@@ -177,6 +180,7 @@ def learn(
     input_fn: InputFn,
     importance_exponent: jax.Array | float,
     priority_exponent: float,
+    augment_fn: AugmentFn | None = None,
     **update_options: Any,
 ) -> tuple[LearnerState, Replay, dict[str, jax.Array]]:
     """Sample, update, set priorities.
@@ -189,11 +193,16 @@ def learn(
         input_fn: see `replay.sample`.
         importance_exponent: beta, 0.4 -> 1 over training.
         priority_exponent: alpha.
+        augment_fn: changes what is learned from to something equivalent.
         **update_options: keyword arguments of `update`.
     """
+    sample_key, augment_key = jax.random.split(key)
     batch = replay_lib.sample(
-        replay, key, batch_size=batch_size, importance_exponent=importance_exponent, input_fn=input_fn
+        replay, sample_key, batch_size=batch_size, importance_exponent=importance_exponent, input_fn=input_fn
     )
+    if augment_fn is not None:
+        inputs, action = augment_fn(augment_key, batch.inputs, batch.action)
+        batch = batch.replace(inputs=inputs, action=action)
     state, errors, metrics = update(state, batch, **update_options)
     replay = replay_lib.set_priorities(replay, batch.rows, errors, priority_exponent=priority_exponent)
     return state, replay, metrics

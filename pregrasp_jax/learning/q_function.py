@@ -1,6 +1,7 @@
 """A Q-function: what the network sees of an observation, and what it says about pushes."""
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 from pregrasp_jax import grid
 from pregrasp_jax.config import NetworkConfig, TaskConfig
 from pregrasp_jax.heightmap import network_input
-from pregrasp_jax.learning.compact import CompactNetwork, look_around_hand, window_size
+from pregrasp_jax.learning.compact import CompactNetwork, look_around_hand, mirror_window, window_size
 from pregrasp_jax.learning.networks import QNetwork
 from pregrasp_jax.learning.replay import InputFn
 from pregrasp_jax.types import Observation
@@ -29,10 +30,13 @@ class QFunction:
     Attributes:
         network: has ``__call__(inputs) -> [B, H, W, 2]`` and ``q_of_action(inputs, action [B]) -> [B]``.
         input_fn: (observation, target slot) -> inputs, unbatched.
+        mirror_fn: inputs of B scenes -> the same reflected in the robot's plane y = 0. Then a value is the mean of what
+            the network says of a scene and of its mirror image; None leaves the network alone.
     """
 
     network: nn.Module
     input_fn: InputFn
+    mirror_fn: Callable[[Any], Any] | None = None
 
     def init(self, key: jax.Array) -> Params:
         """Return initial parameters."""
@@ -51,11 +55,24 @@ class QFunction:
 
     def apply(self, params: Params, inputs: Any) -> jax.Array:
         """Return the values [B, H, W, 2] of all pushes."""
-        return jnp.asarray(self.network.apply({"params": params}, inputs))
+        q = jnp.asarray(self.network.apply({"params": params}, inputs))
+        if self.mirror_fn is None:
+            return q
+        mirrored = jnp.asarray(self.network.apply({"params": params}, self.mirror_fn(inputs)))
+        return (q + mirrored[:, ::-1]) / 2
 
     def of_action(self, params: Params, inputs: Any, action: jax.Array) -> jax.Array:
-        """Return the values [B] of the pushes `action` [B] only, the same as in `apply` but cheaper."""
+        """Return what the network says of the pushes `action` [B] only, the scenes taken as they are, [B]."""
         return jnp.asarray(self.network.apply({"params": params}, inputs, action, method="q_of_action"))
+
+    def augment(self, key: jax.Array, inputs: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+        """Reflect each of B scenes and its push [B] with probability 1/2, if there is a `mirror_fn`."""
+        if self.mirror_fn is None:
+            return inputs, action
+        mirrored = jax.random.bernoulli(key, shape=action.shape)
+        reflection = self.mirror_fn(inputs), grid.mirror_action(action)
+        choose = jax.vmap(jnp.where, in_axes=(0, 0, 0))
+        return jax.tree.map(functools.partial(choose, mirrored), reflection, (inputs, action))
 
     def values(self, params: Params, obs: Observation, target_slot: jax.Array) -> jax.Array:
         """Return the values [H, W, 2] of all pushes after one observation."""
@@ -66,9 +83,16 @@ class QFunction:
 def make_q_function(network: NetworkConfig, task: TaskConfig) -> QFunction:
     """Return the Q-function of a configuration."""
     if network.architecture == "paper":
-        return QFunction(QNetwork(width=network.width, initial_bias=network.initial_bias), network_input)
+        mirror_fn = mirror_images if network.mirror else None
+        return QFunction(QNetwork(width=network.width, initial_bias=network.initial_bias), network_input, mirror_fn)
     channels = max(1, round(_COMPACT_CHANNELS * network.width))
     return QFunction(
         CompactNetwork(channels=channels, initial_bias=network.initial_bias),
         functools.partial(look_around_hand, size=window_size(task)),
+        mirror_window if network.mirror else None,
     )
+
+
+def mirror_images(images: jax.Array) -> jax.Array:
+    """Reflect images [B, H, W, ...] in the robot's plane y = 0: rows are y."""
+    return images[:, ::-1]

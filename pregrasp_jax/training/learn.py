@@ -15,7 +15,7 @@ import optax
 from pregrasp_jax.config import LearnerConfig, ReplayConfig, TaskConfig
 from pregrasp_jax.learning import hindsight, learner
 from pregrasp_jax.learning import replay as replay_lib
-from pregrasp_jax.learning.learner import ApplyFn, LearnerState, MaskFn, Params, QAtFn
+from pregrasp_jax.learning.learner import ApplyFn, AugmentFn, LearnerState, MaskFn, Params, QAtFn
 from pregrasp_jax.learning.replay import InputFn, Replay, Steps
 from pregrasp_jax.training.collect import Experience
 
@@ -101,6 +101,7 @@ def make_update(
     q_at_fn: QAtFn,
     mask_fn: MaskFn,
     input_fn: InputFn,
+    augment_fn: AugmentFn | None,
     optimizer: optax.GradientTransformation,
     config: LearnerConfig,
     replay_config: ReplayConfig,
@@ -112,6 +113,7 @@ def make_update(
         q_at_fn: the network at the taken actions.
         mask_fn: the half ring.
         input_fn: fuses an observation for a goal.
+        augment_fn: see `learner.learn`.
         optimizer: see `make_optimizer`.
         config: discount, loss, batch.
         replay_config: prioritization.
@@ -125,6 +127,7 @@ def make_update(
             sample_key,
             batch_size=config.batch_size,
             input_fn=input_fn,
+            augment_fn=augment_fn,
             importance_exponent=beta,
             priority_exponent=replay_config.priority_exponent,
             apply_fn=apply_fn,

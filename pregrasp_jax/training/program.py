@@ -151,6 +151,7 @@ def make_program(
         q_at_fn=q.of_action,
         mask_fn=env.action_mask,
         input_fn=q.input_fn,
+        augment_fn=q.augment,
         optimizer=optimizer,
         config=config.learner,
         replay_config=config.replay,
