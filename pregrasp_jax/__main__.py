@@ -1,4 +1,4 @@
-"""Look at objects, scenes and runs, compare evaluations, ask what the machine offers."""
+"""Look at objects, scenes and runs, compare evaluations, repeat what diverged, ask what the machine offers."""
 
 import functools
 import sys
@@ -8,6 +8,7 @@ import tyro
 
 from pregrasp_jax.cli import commands
 from pregrasp_jax.cli.demo import demo
+from pregrasp_jax.cli.replay import replay_dump
 from pregrasp_jax.cli.report import report
 from pregrasp_jax.command_line import one_line_errors, parse
 
@@ -16,6 +17,7 @@ COMMANDS = {
     "compare": commands.compare,
     "demo": demo,
     "doctor": commands.doctor,
+    "replay-dump": replay_dump,
     "report": report,
     "scenes": commands.scenes,
     "show": commands.show,

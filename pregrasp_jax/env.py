@@ -7,6 +7,7 @@ its `StepResult` says terminated or truncated.
 import dataclasses
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -94,27 +95,37 @@ class Env:
         Returns:
             The next state, which is never reset here, and what the push did.
         """
+        plan = self.plan(state, action)
+        physics = self.engine.run(state.physics, plan.ctrl, jnp.where(plan.reachable, plan.num_ctrl, 0))
+        return self.conclude(state, action, plan.reachable, physics)
+
+    def plan(self, state: EnvState, action: jax.Array) -> primitives.Plan:
+        """Return the motion of a push, reachable or not; see `step`."""
         row, col, aperture = grid.decode_action(action)
-        p2 = grid.cell_to_world(row, col)
-        plan = primitives.plan_push(
+        return primitives.plan_push(
             state.physics_obs.joint_pos[:6],
             state.p1,
-            p2,
+            grid.cell_to_world(row, col),
             state.aperture,
             aperture,
             push_speed=self.task.push_speed,
             num_rows=primitives.num_push_rows(self.max_distance, self.task.push_speed),
         )
-        physics = self.engine.run(state.physics, plan.ctrl, jnp.where(plan.reachable, plan.num_ctrl, 0))
-        next_state = self._look(
+
+    def conclude(
+        self, state: EnvState, action: jax.Array, reachable: jax.Array, physics: Any
+    ) -> tuple[EnvState, StepResult]:
+        """Look and judge, as `step` does, once `physics` has run through the plan of a push; () bool `reachable`."""
+        row, col, aperture = grid.decode_action(action)
+        next_state = self.look(
             state.replace(
                 physics=physics,
-                p1=jnp.where(plan.reachable, p2, state.p1),
-                aperture=jnp.where(plan.reachable, aperture, state.aperture),
-                num_pushes=state.num_pushes + plan.reachable,
+                p1=jnp.where(reachable, grid.cell_to_world(row, col), state.p1),
+                aperture=jnp.where(reachable, aperture, state.aperture),
+                num_pushes=state.num_pushes + reachable,
             )
         )
-        outcome = self._outcome(state, next_state, plan.reachable)
+        outcome = self._outcome(state, next_state, reachable)
         reward, terminated, reason = judge(
             outcome, state.scene.target, obstacles_may_leave=self.task.obstacles_may_leave
         )
@@ -147,7 +158,7 @@ class Env:
         blank = jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8)
         physics = self.engine.reset(self.engine.init(), scene)
         p1 = jnp.asarray(robot.START_POSE[:2], jnp.float32)
-        return self._look(
+        return self.look(
             EnvState(
                 physics=physics,
                 scene=scene,
@@ -167,7 +178,7 @@ class Env:
         turned = jax.vmap(functools.partial(_turn, yaw=yaw))(poses)
         return SceneParams(object_ids, jnp.where((object_ids >= 0)[:, None], turned, poses), target.astype(jnp.int32))
 
-    def _look(self, state: EnvState) -> EnvState:
+    def look(self, state: EnvState) -> EnvState:
         """Return the state with everything that is seen or measured brought up to date with its physics."""
         physics_obs = self.engine.observe(state.physics)
         hulls = heightmap.scene_hulls(self.bank, state.scene, physics_obs)
@@ -217,9 +228,12 @@ def make_env(
     bank = load_bank_for(config.assets.object_dir, config.assets.object_set)
     engine = make_engine(config.physics.engine, bank, threads=threads)
     scenes = scene_bank.load_or_build(bank, config.scene, split, threads=threads, progress=progress)
-    guided = config.exploration.guided
-    max_distance = config.task.r_out if guided else float(np.hypot(0.5, 0.5) + 0.1)
-    return Env(task=config.task, bank=bank, scenes=scenes, engine=engine, max_distance=max_distance)
+    return Env(task=config.task, bank=bank, scenes=scenes, engine=engine, max_distance=longest_push(config))
+
+
+def longest_push(config: Config) -> float:
+    """Return the length, m, of the longest push that is planned: unguided exploration goes anywhere at once."""
+    return config.task.r_out if config.exploration.guided else float(np.hypot(0.5, 0.5) + 0.1)
 
 
 def with_task(env: Env, **changes: object) -> Env:

@@ -117,7 +117,7 @@ class PhysicsObservation(struct.PyTreeNode):
         object_poses: [MAX_OBJECTS, 7] float32.
         joint_pos: [8] float32 rad: six arm joints, left and right finger drive.
         hand_pose: [7] float32 pose of the grasp point frame (x forward, z up) in the world.
-        diverged: () bool, NaN or an engine warning.
+        diverged: () bool, what the engine holds makes no sense (see `physics.base`): NaN, too fast, too deep, fallen.
         overflows: () int32 physics steps since the reset in which the engine had no room for every contact.
     """
 
@@ -153,7 +153,7 @@ class Outcome(struct.PyTreeNode):
         off_table: [MAX_OBJECTS] bool, outside the workspace or below the table after the push.
         unreachable: () bool, the push could not be executed, or ended more than 10 mm away.
         no_action: () bool, the half ring after the push holds no cell.
-        diverged: () bool, the physics returned NaN.
+        diverged: () bool, the physics diverged.
     """
 
     coverage: jax.Array

@@ -2,16 +2,23 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import trimesh
-from fake_training import make_config
+from fake_training import PictureEnv, make_config
 from trimesh.exchange.obj import export_obj
 
+from pregrasp_jax import io
+from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.mesh_file import MAX_BYTES
 from pregrasp_jax.checkpoint import Ring, save, save_policy, trees, write_config
 from pregrasp_jax.config import PRESETS
+from pregrasp_jax.training.dump import make_dump
+from pregrasp_jax.training.mishap import no_mishap
 
 FAKE_HASHES = {"hull bank": "hulls", "training scenes": "scenes", "validation scenes": "scenes"}
 """Of the world without physics."""
@@ -25,6 +32,7 @@ def make_bad_files(folder: Path) -> None:
     make_bad_runs(folder)
     make_bad_policies(folder)
     make_bad_evaluations(folder)
+    make_bad_dumps(folder)
     for name, write in BAD_MESHES.items():
         (folder / "meshes" / name).mkdir(parents=True)
         write(folder / "meshes" / name)
@@ -62,6 +70,27 @@ def make_bad_evaluations(folder: Path) -> None:
     for name, scenes in (("a", "s"), ("b", "t")):
         (folder / f"{name}.json").write_text(json.dumps(document | {"scene_bank_hash": scenes}))
     (folder / "list.json").write_text("[]")
+
+
+def make_bad_dumps(folder: Path) -> None:
+    """Write dumps of objects that nobody has, of those that ship, cut short, of another format, of another config."""
+    builtin = PictureEnv(bank=SimpleNamespace(content_hash=builtin_bank("seen").content_hash))
+    mishap = no_mishap(jax.vmap(PictureEnv().reset_to)(jnp.arange(1)))
+    for name, env in {"others": PictureEnv(), "builtin": builtin}.items():
+        written: Any = make_dump(cast(Any, env), make_config())(folder / "dumps", mishap)
+        written.rename(folder / f"{name}.npz")
+    data = (folder / "others.npz").read_bytes()
+    (folder / "cut.npz").write_bytes(data[: len(data) // 2])
+    with np.load(folder / "others.npz") as file:
+        arrays = dict(file)
+    about = json.loads(str(arrays.pop("about")))
+    for name, change in {
+        "newer": {"format": "pregrasp_jax dump 2"},
+        "typo": {"config": {"sead": 1}},
+        "bullet": {"engine": "bullet", "hull_bank_hash": builtin.bank.content_hash},
+    }.items():
+        io.write_npz(folder / f"{name}.npz", about=np.array(json.dumps(about | change)), **arrays)
+    io.write_npz(folder / "numbers.npz", a=np.zeros(3))
 
 
 def flip_last_byte(path: Path) -> None:

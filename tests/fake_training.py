@@ -19,6 +19,7 @@ from pregrasp_jax.config import PRESETS, Config, from_dict, to_dict
 from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.training import program
 from pregrasp_jax.training.console import Console
+from pregrasp_jax.training.dump import make_dump
 from pregrasp_jax.training.run_folder import RunFolder
 from pregrasp_jax.training.trainer import Trainer
 from pregrasp_jax.types import MAX_OBJECTS, EnvState, Observation, StepResult
@@ -32,6 +33,9 @@ class PictureEnv(FakeEnv):
 
     bank: Any = dataclasses.field(
         default_factory=lambda: SimpleNamespace(eligible=np.array([True, True, False]), content_hash="hulls")
+    )
+    engine: Any = dataclasses.field(
+        default_factory=lambda: SimpleNamespace(name="native", coordinates=lambda _: (np.zeros(0), np.zeros(0)))
     )
 
     def reset(self, key: jax.Array) -> EnvState:
@@ -105,9 +109,10 @@ def make_trainer(
     said: TextIO | None = None,
     env: Any = None,
 ) -> Trainer:
+    env = env or PictureEnv()
     built = make_program(config, env)
     folder = RunFolder.open(path, config) if resume else RunFolder.create(path, config)
-    trainer = Trainer(config, folder, built, evaluate, Console(said or io.StringIO()))
+    trainer = Trainer(config, folder, built, evaluate, make_dump(env, config), Console(said or io.StringIO()))
     if begin:
         (trainer.resume if folder.has_checkpoint else trainer.begin)()
     return trainer

@@ -127,6 +127,33 @@ POLICIES = [
     ("pregrasp_jax compare {w}/a.json {w}/b.json", "cannot pair: scene_bank_hash is s in the first file and t in the"),
 ]
 
+DUMPS = [
+    ("pregrasp_jax replay-dump", "Missing from", "DUMP"),
+    ("pregrasp_jax replay-dump {w}/others.npz --engine warp", "Expected one of ('None', 'native', 'mjx')"),
+    ("pregrasp_jax replay-dump {w}/others.npz --png {w}", "{w} is a folder; allowed is the name of a file"),
+    (
+        "pregrasp_jax replay-dump {w}/nothing",
+        "{w}/nothing does not exist or is no file; wanted is a file of RUN_DIR/du",
+    ),
+    ("pregrasp_jax replay-dump {w}/full", "{w}/full does not exist or is no file; wanted is a file of RUN_DIR/dumps"),
+    ("pregrasp_jax replay-dump {w}/noise", "{w}/noise is damaged or no npz; wanted is a file of RUN_DIR/dumps that"),
+    (
+        "pregrasp_jax replay-dump {w}/cut.npz",
+        "{w}/cut.npz is damaged or no npz; wanted is a file of RUN_DIR/dumps that",
+    ),
+    ("pregrasp_jax replay-dump {w}/numbers.npz", "{w}/numbers.npz is no dump of this version; wanted is a file of RUN"),
+    ("pregrasp_jax replay-dump {w}/newer.npz", "{w}/newer.npz is no dump of this version; wanted is a file of RUN_DIR"),
+    ("pregrasp_jax replay-dump {w}/typo.npz", "{w}/typo.npz: unknown config key sead; allowed here: assets"),
+    (
+        "pregrasp_jax replay-dump {w}/others.npz",
+        "{w}/others.npz is of other objects (hull bank hulls, the built-in seen objects have ",
+        "); wanted are those of the training: --object-dir",
+    ),
+    ("pregrasp_jax replay-dump {w}/others.npz --object-dir {w}/nothing", "{w}/nothing: no such folder; allowed is a"),
+    ("pregrasp_jax replay-dump {w}/bullet.npz", "physics.engine = 'bullet' does not exist; allowed: native, mjx, warp"),
+    ("pregrasp_jax replay-dump {w}/builtin.npz", "{w}/builtin.npz: state/physics/", "wanted is a file of RUN_DIR"),
+]
+
 MESHES = {
     "nothing": "{f}: holds no mesh; allowed are .obj, .stl, .ply, .glb files",
     "flat": "m.stl: flat: 50 x 4 x 150 mm; allowed is at least 10 mm",
@@ -236,7 +263,7 @@ def refusal(world, tmp_path, monkeypatch, capsys) -> Any:
     return call
 
 
-@pytest.mark.parametrize("row", [*COMMAND_LINES, *PLACES, *RUNS, *POLICIES, *OBJECTS], ids=lambda row: row[0])
+@pytest.mark.parametrize("row", [*COMMAND_LINES, *PLACES, *RUNS, *POLICIES, *DUMPS, *OBJECTS], ids=lambda row: row[0])
 def test_what_is_wrong_is_one_line_and_nothing_is_written(world, refusal, row):
     command_line, *said = row
     error = refusal(command_line)

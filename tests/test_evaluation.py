@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fake_env import fake_env, make_scenes
+from jax.tree_util import Partial
 
 from pregrasp_jax import grid, policies
 from pregrasp_jax.config import Config, SceneConfig, TaskConfig
@@ -85,6 +86,22 @@ def test_seed_moves_only_the_policy() -> None:
     evaluator = Evaluator(ENV, num_envs=12)
     assert evaluator.run(random, episodes=12, seed=0) != evaluator.run(random, episodes=12, seed=1)
     assert evaluator.run(straight, episodes=12, seed=0) == evaluator.run(straight, episodes=12, seed=1)
+
+
+def test_a_run_compiles_nothing_that_was_not_announced() -> None:
+    """After `compile`, runs of policies of that kind find everything there, and end as they would without it."""
+    straight = policies.make_straight(ENV)
+
+    def act(far: jax.Array, state: EnvState, key: jax.Array) -> jax.Array:
+        return jnp.where(far > 0, straight(state, key), 0)
+
+    evaluator = Evaluator(ENV, num_envs=5)
+    evaluator.compile(Partial(act, jnp.float32(1)), episodes=12)
+    compiled = dict(evaluator._compiled)
+    results = [evaluator.run(Partial(act, jnp.float32(far)), episodes=12) for far in (1, 0)]
+    assert evaluator._compiled == compiled and len(compiled) == 4
+    assert results[0] == evaluate_policy(ENV, straight, episodes=12, num_envs=5) and results[0].successes
+    assert results[1].failures == {"unreachable": 12}
 
 
 def _scene_far_away(pushes: int) -> Any:

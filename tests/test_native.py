@@ -125,6 +125,43 @@ def test_a_diverged_scene_is_reported_alone_and_stays_diverged(engine, scenes, t
     np.testing.assert_array_equal(again.diverged, [True, False])
 
 
+def test_too_deep_and_too_fast_end_a_scene_and_nothing_else_does(engine, scenes):
+    """15 mm deep in the table is not too deep, and what is too deep counts though it is pressed out at once."""
+    states = [engine.reset(engine.init(), packed_scene(scenes, 0)) for _ in range(5)]
+    wanted = {"shallow": False, "in the table": True, "in each other": True, "fast": True, "healthy": False}
+    for index, name in enumerate(wanted):
+        qpos, qvel = (np.array(x) for x in engine.coordinates(states[index]))
+        first, second = 10, 17  # the arm and the fingers have ten
+        if "table" in name or name == "shallow":
+            qpos[first + 2] -= 0.06 if name == "in the table" else 0.015
+        if name == "in each other":
+            qpos[first : first + 3] = qpos[second : second + 3]
+        if name == "fast":
+            qvel[-1] = 150.0
+        states[index] = engine.place(states[index].object_ids, jnp.asarray(qpos), jnp.asarray(qvel))
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    planned = plan(jnp.asarray(robot.home_joint_pos()[:6]), robot.START_POSE[:2], (-0.25, 0.0))
+    run = jax.vmap(lambda state: engine.run(state, planned.ctrl, jnp.int32(2)))
+    after = run(batch)
+    np.testing.assert_array_equal(after.diverged, list(wanted.values()))
+    moved = np.abs(np.asarray(after.object_poses - batch.object_poses))[2, :2, :3].max()
+    assert moved < 1, "it was too deep, and neither fast nor infinite"
+    np.testing.assert_array_equal(run(after).diverged, list(wanted.values()))
+
+
+def test_coordinates_put_a_scene_into_the_same_place(engine, scenes):
+    packed = jax.tree.map(lambda *x: jnp.stack(x), packed_scene(scenes, 0), packed_scene(scenes, 1))
+    states = jax.vmap(lambda scene: push(engine, engine.reset(engine.init(), scene), robot.START_POSE[:2], ENDS[1]))(
+        packed
+    )
+    again = jax.vmap(lambda s: engine.place(s.object_ids, *engine.coordinates(s)))(states)
+    for old, new in zip(*(jax.tree.leaves(engine.observe(s)) for s in (states, again)), strict=True):
+        np.testing.assert_array_equal(old, new)
+    for old, new in zip(*(jax.vmap(engine.coordinates)(s) for s in (states, again)), strict=True):
+        np.testing.assert_array_equal(old, new)
+    assert engine.coordinates(jax.tree.map(lambda leaf: leaf[0], states))[1].shape == (58,)
+
+
 def test_an_unknown_engine_is_refused():
     with pytest.raises(ValueError, match=r"physics.engine = 'bullet' .* allowed: native"):
         make_engine("bullet", builtin_bank("seen"))

@@ -244,6 +244,7 @@ def test_tally_keeps_the_reasons_of_the_last_episodes():
         reward=jnp.float32(0),
         explored=jnp.int32(0),
         overflowed=jnp.int32(0),
+        diverged=jnp.int32(0),
         reasons=jnp.zeros(len(REASONS), jnp.int32),
     )
     success, truncated = REASONS.index("target_in_region"), REASONS.index("truncated")
@@ -251,15 +252,17 @@ def test_tally_keeps_the_reasons_of_the_last_episodes():
     for reason, ended in pushes:
         results: Any = SimpleNamespace(reason=jnp.array(reason), reward=jnp.ones(3))
         random, overflowed = jnp.array([True, False, False]), jnp.array([reason[0] == success, False, True])
-        tally = collect._count(tally, results, jnp.array(ended, bool), random, overflowed)
+        diverged = jnp.array([False, False, False, reason[1] == success, True])  # with a branch of two scenes
+        tally = collect._count(tally, results, jnp.array(ended, bool), random, overflowed, diverged)
     report = collect.report(tally)
     assert report["train/success_rate"] == 0.5, "the first success has left the window of four"
     assert (report["episodes"], report["env_steps"]) == (5, 9)
     assert (report["reasons/target_in_region"], report["reasons/truncated"]) == (3, 2)
     assert report["train/explored"] == pytest.approx(1 / 3) and report["train/episode_length"] == pytest.approx(9 / 5)
     assert report["physics/overflows"] == 4, "one in the first scene, three in the last"
+    assert report["physics/diverged"] == 4, "one in one branch, three in the last"
     fresh = collect.report(tally.begin_report())
-    assert fresh["physics/overflows"] == 0
+    assert fresh["physics/overflows"] == 0 and fresh["physics/diverged"] == 0
     assert fresh["train/success_rate"] == 0.5 and fresh["train/reward"] is None and fresh["episodes"] == 5
 
 

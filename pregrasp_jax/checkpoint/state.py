@@ -119,7 +119,10 @@ def restore(folder: Path, template: Any, ring_template: Any) -> Restored:
             damaged[path] = str(error)
             continue
         except ValueError as error:
-            raise ValueError(f"{error}; allowed is a checkpoint of the same configuration and version") from None
+            raise ValueError(
+                f"{error}; allowed is a checkpoint of the same configuration and version; --init-from starts a new run "
+                "from its parameters"
+            ) from None
         for broken in damaged:
             _set_aside(broken)
         return Restored(manifest["step"], tree, ring, manifest["extra"], tuple(damaged.values()))

@@ -34,7 +34,7 @@ def demo(*, run_dir: Path = Path("runs/demo"), minutes: float = 5.0, episodes: i
         with EpisodeProgress() as progress:
             progress.say(f"evaluating {policy}")
             players[policy] = make_player(request, say=progress.say)
-            documents.append(run_evaluation(request, players[policy], progress=progress))
+            documents.append(run_evaluation(request, players[policy], progress=progress, say=progress.say))
     print(format_evaluations(documents))
     film = run_dir / "demo.gif"
     film_episodes(film, players[_SHIPPED], episodes=min(_FILMED, episodes), seed=0)

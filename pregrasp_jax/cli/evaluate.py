@@ -29,7 +29,7 @@ def evaluate(
         raise ValueError(f"video_episodes = {video_episodes} is out of range; allowed is 1 to {request.episodes}")
     with EpisodeProgress() as progress:
         player = make_player(request, say=progress.say)
-        document = run_evaluation(request, player, progress=progress)
+        document = run_evaluation(request, player, progress=progress, say=progress.say)
         print(format_evaluation(document))
         if json_file:
             io.write_json(json_file, document)

@@ -82,7 +82,7 @@ def make_play(player: Player, seed: int) -> Callable[[int], Iterator[Decision]]:
     Keys and rounding are those of `evaluation.Evaluator`, so what is drawn is what was counted.
     """
     env = player.env
-    reset, step, decide, grasp = (_in_batch(f) for f in (env.reset_to, env.step, player.policy, env.grasp))
+    reset, step, decide, grasp = (in_batch(f) for f in (env.reset_to, env.step, player.policy, env.grasp))
 
     def play(scene: int) -> Iterator[Decision]:
         state = reset(jnp.int32(scene))
@@ -101,7 +101,7 @@ def make_play(player: Player, seed: int) -> Callable[[int], Iterator[Decision]]:
     return play
 
 
-def _in_batch(function: Callable[..., Any]) -> Callable[..., Any]:
+def in_batch(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the compiled function of one scene that rounds as in a batch (see `evaluation.runner.MIN_BATCH`)."""
     batched = jax.jit(jax.vmap(function))
 

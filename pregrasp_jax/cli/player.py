@@ -16,6 +16,7 @@ from pregrasp_jax.env import Env, make_env, with_task
 from pregrasp_jax.evaluation import Evaluator, Progress, evaluation_document
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.policies import Policy
+from pregrasp_jax.training.console import announced_compilation
 from pregrasp_jax.training.program import enable_compilation_cache
 
 PRETRAINED = Path(__file__).parent.parent / "pretrained"
@@ -114,12 +115,30 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     )
 
 
-def run_evaluation(request: EvaluationConfig, player: Player, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Run the episodes and return the evaluation document (see `evaluation.evaluation_document`)."""
+def run_evaluation(
+    request: EvaluationConfig,
+    player: Player,
+    *,
+    progress: Progress | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Run the episodes and return the evaluation document (see `evaluation.evaluation_document`).
+
+    Args:
+        request: what is evaluated.
+        player: from `make_player`.
+        progress: told when episodes end.
+        say: told about compilation.
+
+    Raises:
+        ValueError: more episodes than scenes.
+    """
     enable_compilation_cache()
     start = time.monotonic()
     default = LOOKAHEAD_NUM_ENVS if request.policy == "lookahead" else NUM_ENVS
     evaluator = Evaluator(player.env, num_envs=request.num_envs or default)
+    with announced_compilation(say):
+        evaluator.compile(player.policy, episodes=request.episodes)
     result = evaluator.run(player.policy, episodes=request.episodes, seed=request.seed, progress=progress)
     return evaluation_document(
         result,

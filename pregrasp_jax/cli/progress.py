@@ -32,7 +32,7 @@ class EpisodeProgress:
             disable=not self._console.is_terminal,
             transient=True,
         )
-        self._task = self._progress.add_task("compiling", total=1.0)
+        self._task = self._progress.add_task("waiting for the first episodes", total=1.0)
         self._last_line = time.monotonic()
         self._first: tuple[float, int] | None = None
 

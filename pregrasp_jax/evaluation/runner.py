@@ -4,7 +4,7 @@
 every scene runs to its end and no result depends on `num_envs`: keys derive from scene and push number.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
 import flax.struct as struct
@@ -60,6 +60,22 @@ class Evaluator:
         self._restart = jax.jit(jax.vmap(self._restart_one))
         self._push = jax.jit(jax.vmap(self._push_one, in_axes=(None, 0, None)))
         self._grasp = jax.jit(jax.vmap(env.grasp))
+        self._compiled: dict[Hashable, Callable[..., Any]] = {}
+
+    def compile(self, policy: Policy, *, episodes: int) -> None:
+        """Compile now what `run` compiles on its way otherwise; it may take minutes.
+
+        Args:
+            policy: the one that will run, or one of the same kind.
+            episodes: as many as will run.
+        """
+        indices = np.zeros(self._batch_size(episodes), np.int32)
+        runs = jax.eval_shape(self._start, indices)
+        enclosed = jax.eval_shape(self._start, np.zeros(self._num_envs, np.int32))
+        self._program(self._start, indices)
+        self._program(self._push, _bound(policy), runs, jax.random.key(0))
+        self._program(self._restart, runs, indices)
+        self._program(self._grasp, enclosed.state)
 
     def run(
         self,
@@ -106,29 +122,44 @@ class Evaluator:
 
     def _run_to_ends(self, policy: Policy, episodes: int, key: jax.Array) -> Iterator[_Run]:
         """Yield every scene when its pushes have ended, as host arrays."""
-        policy = policy if isinstance(policy, Partial) else Partial(policy)
-        num_envs = max(min(self._num_envs, episodes), MIN_BATCH)
+        policy, num_envs = _bound(policy), self._batch_size(episodes)
         waiting = iter(range(num_envs, episodes))
         busy = np.arange(num_envs) < episodes
-        runs = self._start(jnp.where(busy, jnp.arange(num_envs), 0))
+        runs = self._call(self._start, np.where(busy, np.arange(num_envs), 0).astype(np.int32))
         while busy.any():
-            runs = self._push(policy, runs, key)
+            runs = self._call(self._push, policy, runs, key)
             ended = np.flatnonzero(busy & (np.asarray(runs.reason) != RUNNING))
             if ended.size == 0:
                 continue
             host = jax.device_get(runs)
             yield from (jax.tree.map(lambda leaf, slot=slot: leaf[slot], host) for slot in ended)
-            following = np.full(num_envs, -1)
+            following = np.full(num_envs, -1, np.int32)
             following[ended] = [next(waiting, -1) for _ in ended]
             busy[ended] = following[ended] >= 0
-            runs = self._restart(runs, following)
+            runs = self._call(self._restart, runs, following)
+
+    def _batch_size(self, episodes: int) -> int:
+        """Return how many scenes are pushed side by side."""
+        return max(min(self._num_envs, episodes), MIN_BATCH)
+
+    def _program(self, function: Any, *args: Any) -> Callable[..., Any]:
+        """Return a jitted function compiled for arguments like these; it is compiled once."""
+        leaves, structure = jax.tree.flatten(args)
+        kind = (function, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
+        if kind not in self._compiled:
+            self._compiled[kind] = function.lower(*args).compile()
+        return self._compiled[kind]
+
+    def _call(self, function: Any, *args: Any) -> Any:
+        return self._program(function, *args)(*args)
 
     def _grasp_all(self, runs: list[_Run]) -> list[Episode]:
         """Execute the grasp in up to `num_envs` scenes; the batch is filled up with copies of the last."""
         if not runs:
             return []
         padded = runs + runs[-1:] * (self._num_envs - len(runs))
-        held = self._grasp(jax.tree.map(lambda *leaves: np.stack(leaves), *(run.state for run in padded)))
+        states = jax.tree.map(lambda *leaves: np.stack(leaves), *(run.state for run in padded))
+        held = self._call(self._grasp, states)
         return [self._episode(run, held=bool(ok)) for run, ok in zip(runs, np.asarray(held), strict=False)]
 
     def _episode(self, run: _Run, *, held: bool = True) -> Episode:
@@ -181,6 +212,11 @@ def evaluate_policy(
     return Evaluator(env, num_envs=num_envs).run(
         policy, episodes=episodes, seed=seed, with_grasp=with_grasp, progress=progress
     )
+
+
+def _bound(policy: Policy) -> Partial:
+    """Return a policy as a pytree."""
+    return policy if isinstance(policy, Partial) else Partial(policy)
 
 
 def _where(condition: jax.Array, when: Any, otherwise: Any) -> Any:

@@ -14,7 +14,7 @@ import mujoco
 from mujoco import mjx
 from mujoco.mjx._src import constraint, forward, smooth, solver
 
-from pregrasp_jax.physics.base import CTRL_DT, MAX_SPEED, NUM_CONTROLS, Engine
+from pregrasp_jax.physics.base import CTRL_DT, MAX_PENETRATION, MAX_SPEED, NUM_CONTROLS, Engine
 from pregrasp_jax.physics.hull_collision import ContactCounts, Limits, collide
 from pregrasp_jax.physics.mjx_model import MjxSlotModel, fill_slots, make_mjx_slot_model
 from pregrasp_jax.robot import model as robot
@@ -25,9 +25,6 @@ from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, HullBank, PhysicsObservat
 LIMITS = Limits(max_hull_pairs=32, max_robot_pairs=16, max_contact_points=64)
 """Sizes for 8 slots of 6 hulls. Over 2513 states of pushes through 100 packed scenes of the seen set the 99.9th
 percentiles are 25 hull pairs, 11 robot pairs and 48 contacts (most seen: 25, 12 and 50)."""
-
-MAX_PENETRATION = 0.02
-"""m; a scene in which two bodies overlap deeper than this has diverged."""
 
 MAX_FALL = 0.05
 """m; an object whose frame is this far below the table has gone through it: diverged."""
@@ -84,21 +81,25 @@ def make_engine(
     parked = jnp.asarray(parking_poses(), float)
     zero = jnp.int32(0)
 
-    def reset(state: MjxState, scene: SceneParams) -> MjxState:
-        del state
-        no_slot = jnp.any(scene.object_ids[num_slots:] >= 0)
+    def place(object_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> MjxState:
+        no_slot = jnp.any(object_ids[num_slots:] >= 0)
         return MjxState(
-            qpos=home_qpos.at[model.qpos_ids].set(scene.poses[:num_slots]),
-            qvel=jnp.zeros(model.mj_model.nv),
+            qpos=qpos,
+            qvel=qvel,
             qacc_warmstart=jnp.zeros(model.mj_model.nv),
-            object_ids=scene.object_ids.astype(jnp.int32),
-            diverged=no_slot | ~jnp.all(jnp.isfinite(scene.poses)),
+            object_ids=object_ids.astype(jnp.int32),
+            diverged=no_slot | ~jnp.all(jnp.isfinite(qpos)),
             pair_overflows=zero,
             contact_overflows=zero,
             max_hull_pairs=zero,
             max_robot_pairs=zero,
             max_contacts=zero,
         )
+
+    def reset(state: MjxState, scene: SceneParams) -> MjxState:
+        del state
+        qpos = home_qpos.at[model.qpos_ids].set(scene.poses[:num_slots])
+        return place(scene.object_ids, qpos, jnp.zeros(model.mj_model.nv))
 
     def init() -> MjxState:
         empty = SceneParams(jnp.full(MAX_OBJECTS, -1, jnp.int32), parked, zero)
@@ -116,7 +117,10 @@ def make_engine(
         overflows = state.pair_overflows + state.contact_overflows
         return PhysicsObservation(poses, joint_pos, grasp_pose(joint_pos[:6]), state.diverged, overflows)
 
-    return Engine("mjx", init, reset, run, observe)
+    def coordinates(state: MjxState) -> tuple[jax.Array, jax.Array]:
+        return state.qpos, state.qvel
+
+    return Engine("mjx", init, reset, run, observe, coordinates, place)
 
 
 def run_controls(

@@ -17,6 +17,7 @@ from pregrasp_jax.config import ExplorationConfig
 from pregrasp_jax.judge import TARGET_IN_REGION
 from pregrasp_jax.learning.learner import ApplyFn, Params, greedy_action
 from pregrasp_jax.learning.replay import InputFn, Steps
+from pregrasp_jax.training.mishap import Mishap, no_mishap
 from pregrasp_jax.types import REASONS, EnvState, HullBank, StepResult
 
 RECENT_EPISODES = 200
@@ -55,6 +56,7 @@ class Tally(struct.PyTreeNode):
         reward: () float32 summed over them.
         explored: () int32 of them were random.
         overflowed: () int32 pushes since the last report, branches included, in which the engine dropped contacts.
+        diverged: () int32 pushes since the last report, branches included, after which the physics made no sense.
         reasons: [len(REASONS)] int32 why episodes ended since the last report.
     """
 
@@ -65,6 +67,7 @@ class Tally(struct.PyTreeNode):
     reward: jax.Array
     explored: jax.Array
     overflowed: jax.Array
+    diverged: jax.Array
     reasons: jax.Array
 
     def begin_report(self) -> "Tally":
@@ -74,6 +77,7 @@ class Tally(struct.PyTreeNode):
             reward=jnp.float32(0),
             explored=jnp.int32(0),
             overflowed=jnp.int32(0),
+            diverged=jnp.int32(0),
             reasons=jnp.zeros_like(self.reasons),
         )
 
@@ -85,11 +89,17 @@ class Actors(struct.PyTreeNode):
         env_states: of E scenes.
         key: PRNG key of actions and resets.
         tally: counts.
+        mishap: the first push since the last report after which the physics made no sense.
     """
 
     env_states: EnvState
     key: jax.Array
     tally: Tally
+    mishap: Mishap
+
+    def begin_report(self) -> "Actors":
+        """Return the actors with nothing counted or kept since the last report."""
+        return self.replace(tally=self.tally.begin_report(), mishap=self.mishap.forget())
 
 
 class Experience(struct.PyTreeNode):
@@ -121,9 +131,11 @@ def init_actors(key: jax.Array, env: Environment, num_envs: int) -> Actors:
         reward=jnp.float32(0),
         explored=jnp.int32(0),
         overflowed=jnp.int32(0),
+        diverged=jnp.int32(0),
         reasons=jnp.zeros(len(REASONS), jnp.int32),
     )
-    return Actors(jax.vmap(env.reset)(jax.random.split(reset_key, num_envs)), key, tally)
+    states = jax.vmap(env.reset)(jax.random.split(reset_key, num_envs))
+    return Actors(states, key, tally, no_mishap(states))
 
 
 def make_collect(
@@ -184,9 +196,12 @@ def make_collect(
         next_states, results = jax.tree.map(lambda leaf: leaf[:num_envs], (ends, results))
         ended = results.terminated | results.truncated
         overflowed = ends.physics_obs.overflows > starts.physics_obs.overflows
-        tally = _count(actors.tally, results, ended, random[:, 0], overflowed)
+        diverged = steps.outcome.diverged
+        tally = _count(actors.tally, results, ended, random[:, 0], overflowed, diverged)
+        mishap = actors.mishap.note(states, actions, ends, diverged, tally.env_steps)
         fresh = jax.vmap(env.reset)(jax.random.split(reset_key, num_envs))
-        return Actors(_select(ended, fresh, next_states), key, tally), experience.replace(episodes=tally.episodes)
+        actors = Actors(_select(ended, fresh, next_states), key, tally, mishap)
+        return actors, experience.replace(episodes=tally.episodes)
 
     return collect
 
@@ -223,7 +238,14 @@ def _select(ended: jax.Array, fresh: Any, going_on: Any) -> Any:
     return jax.vmap(lambda e, a, b: jax.tree.map(lambda x, y: jnp.where(e, x, y), a, b))(ended, fresh, going_on)
 
 
-def _count(tally: Tally, results: StepResult, ended: jax.Array, random: jax.Array, overflowed: jax.Array) -> Tally:
+def _count(
+    tally: Tally,
+    results: StepResult,
+    ended: jax.Array,
+    random: jax.Array,
+    overflowed: jax.Array,
+    diverged: jax.Array,
+) -> Tally:
     window = tally.recent.shape[0]
     order = jnp.cumsum(ended, dtype=jnp.int32) - 1
     slots = jnp.where(ended, (tally.episodes + order) % window, window)
@@ -235,6 +257,7 @@ def _count(tally: Tally, results: StepResult, ended: jax.Array, random: jax.Arra
         reward=tally.reward + jnp.sum(results.reward),
         explored=tally.explored + jnp.sum(random, dtype=jnp.int32),
         overflowed=tally.overflowed + jnp.sum(overflowed, dtype=jnp.int32),
+        diverged=tally.diverged + jnp.sum(diverged, dtype=jnp.int32),
         reasons=tally.reasons.at[results.reason].add(ended.astype(jnp.int32)),
     )
 
@@ -252,5 +275,6 @@ def report(tally: Tally) -> dict[str, Any]:
         "train/episode_length": float(counts.pushes / episodes) if episodes else None,
         "train/explored": float(counts.explored / counts.pushes) if counts.pushes else None,
         "physics/overflows": int(counts.overflowed),
+        "physics/diverged": int(counts.diverged),
         **{f"reasons/{name}": int(n) for name, n in zip(REASONS, counts.reasons, strict=True) if name != "running"},
     }

@@ -1,6 +1,7 @@
 """The folder of a run: who may write to it, and its files beside the checkpoints.
 
-runs/NAME/: config.yaml, manifest.json, metrics.jsonl, tensorboard/ (if asked for), checkpoints/, best/, run.lock.
+runs/NAME/: config.yaml, manifest.json, metrics.jsonl, tensorboard/ (if asked for), checkpoints/, best/, dumps/ (if the
+physics diverged), run.lock.
 """
 
 import datetime
@@ -43,6 +44,11 @@ class RunFolder:
     def has_checkpoint(self) -> bool:
         """Whether the run got as far as its first checkpoint."""
         return exists(self.checkpoints)
+
+    @property
+    def dumps(self) -> Path:
+        """Folder of the pushes that the physics did not survive (see `dump`)."""
+        return self.path / "dumps"
 
     @property
     def best(self) -> Path:

@@ -12,6 +12,7 @@ from pregrasp_jax.learning.learner import Params
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.training import resources
 from pregrasp_jax.training.console import Console
+from pregrasp_jax.training.dump import make_dump
 from pregrasp_jax.training.event_log import require_module
 from pregrasp_jax.training.interrupt import Interrupt
 from pregrasp_jax.training.program import enable_compilation_cache, make_program
@@ -66,7 +67,7 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
     program = make_program(env, config, params=params)
     resources.check(*program.shapes().split(), run_dir)
     resumed, folder = folder is not None, folder or RunFolder.create(run_dir, config)
-    trainer = Trainer(config, folder, program, make_evaluate(validation, config), console)
+    trainer = Trainer(config, folder, program, make_evaluate(validation, config), make_dump(env, config), console)
     with folder, Interrupt(console.say, console.close) as interrupt:
         folder.begin_session(_hashes(env, validation))
         (trainer.resume if resumed and folder.has_checkpoint else trainer.begin)()

@@ -15,7 +15,9 @@ from pregrasp_jax.checkpoint import restore, save, save_policy
 from pregrasp_jax.config import Config
 from pregrasp_jax.learning.learner import Params
 from pregrasp_jax.training import collect, learn
-from pregrasp_jax.training.console import Console, format_time
+from pregrasp_jax.training.console import Console, announced_compilation, format_time
+from pregrasp_jax.training.dump import DumpFn
+from pregrasp_jax.training.mishap import NONE
 from pregrasp_jax.training.program import IterateFn, Program, TrainState
 from pregrasp_jax.training.run_folder import RunFolder
 
@@ -72,6 +74,7 @@ class Trainer:
         folder: RunFolder,
         program: Program,
         evaluate: EvaluateFn,
+        dump: DumpFn,
         console: Console,
     ):
         """Compile nothing yet.
@@ -81,12 +84,14 @@ class Trainer:
             folder: locked.
             program: not compiled.
             evaluate: measures parameters on the validation scenes.
+            dump: writes down a push that the physics did not survive.
             console: told about progress.
         """
         self.config = config
         self.folder = folder
         self.program = program
         self.evaluate_fn = evaluate
+        self.dump_fn = dump
         self.console = console
         self.progress = Progress()
         self._saved_at = -1
@@ -135,9 +140,8 @@ class Trainer:
         progress = self.progress
         if progress.share_done(self.config) >= 1.0 and progress.evaluated_at == progress.env_steps:
             return "the run is complete; a higher --train.episodes or --train.minutes extends it"
-        self.console.say("compiling ...")
-        program, seconds = self.program.compile(self.state)
-        self.console.say(f"compiled in {seconds:.1f} s")
+        with announced_compilation(self.console.say):
+            program, _ = self.program.compile(self.state)
         self.console.start()
         while progress.share_done(self.config) < 1.0:
             if stop():
@@ -149,11 +153,13 @@ class Trainer:
                 self.evaluate()
             if progress.total_seconds - self._tried_to_save_at >= 60 * self.config.train.checkpoint_minutes:
                 self.save()
+        self.dump()
         self.evaluate()
         self.save()
         return f"done: {progress.episodes} episodes in {format_time(progress.total_seconds)}"
 
     def _interrupted(self) -> str:
+        self.dump()
         self.save()
         step, path = self.progress.env_steps, self.folder.path
         return f"interrupted at step {step}; continue with `python train.py resume {path}`"
@@ -212,9 +218,10 @@ class Trainer:
         row |= {"train/epsilon": float(epsilon), "time/seconds": progress.total_seconds}
         row |= {f"time/{phase}": progress.seconds[phase] for phase in PHASES}
         row["time/env_steps_per_second"] = steps / max(seconds, 1e-9)
+        self.dump()
         self._refuse_non_finite()
         self._write("metrics", lambda: self.folder.append_metrics(row))
-        self.state = TrainState(actors.replace(tally=actors.tally.begin_report()), learning.begin_report())
+        self.state = TrainState(actors.begin_report(), learning.begin_report())
         self._logged_at = (progress.env_steps, progress.total_seconds)
         share = progress.share_done(self.config)
         self.console.update(row, share=share, eta=self._seconds_left(share))
@@ -227,6 +234,21 @@ class Trainer:
                 f"the loss is {loss} at step {self.progress.env_steps}; the last checkpoint is of step "
                 f"{self._saved_at}; a smaller learner.learning_rate may help"
             )
+
+    def dump(self) -> None:
+        """Write down the first push since the last report that the physics did not survive, if there is one."""
+        mishap = self.state.actors.mishap
+        if int(mishap.action) == NONE:
+            return
+
+        def write() -> None:
+            if path := self.dump_fn(self.folder.dumps, mishap):
+                self.console.say(
+                    f"the physics diverged at step {int(mishap.env_steps)} in scene {int(mishap.scene)}; "
+                    f"`python -m pregrasp_jax replay-dump {path}` repeats the push"
+                )
+
+        self._write("dump", write)
 
     def evaluate(self) -> None:
         """Measure the policy on the validation scenes, and keep it if it is the best (of equals, the newest)."""

@@ -1,9 +1,13 @@
-"""A scene whose physics turns NaN ends with that reason, is counted, and harms neither its neighbours nor the learner.
+"""A scene whose physics turns NaN ends with that reason, is counted, and harms neither its neighbours nor the learner;
+what went before it is written down.
 
 That the native engine reports such a scene, and that the real environment passes it on, is tested beside them.
 """
 
 import dataclasses
+import errno
+import io
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,7 +17,9 @@ import pytest
 from fake_training import PictureEnv, make_config, make_trainer, rows
 
 from pregrasp_jax.judge import judge
+from pregrasp_jax.training import dump
 from pregrasp_jax.training.collect import Actors
+from pregrasp_jax.training.dump import load_dump
 from pregrasp_jax.training.trainer import Trainer
 from pregrasp_jax.types import REASONS, EnvState, StepResult
 
@@ -76,7 +82,64 @@ def test_a_training_counts_such_scenes_and_goes_on(trainer):
     with trainer.folder:
         assert trainer.run(poison_every_third_step).startswith("done: ")
     log = [row for row in rows(trainer.folder.path) if "train/loss" in row]
+    assert [row["physics/diverged"] for row in log] == [row["reasons/nan"] for row in log]
     logged_steps = log[-1]["env_steps"] // trainer.config.train.num_envs
     assert sum(row["reasons/nan"] for row in log) == sum(poisoned[:logged_steps]) > 2
     losses = [row["train/loss"] for row in log if row["train/loss"] is not None]
     assert len(losses) > 2 and np.isfinite(losses).all()
+    num_reports = sum(row["reasons/nan"] > 0 for row in log)
+    dumps = [load_dump(path) for path in sorted(trainer.folder.dumps.iterdir())]
+    assert len(dumps) in (num_reports, num_reports + 1), "one for each report, and what came after the last"
+    for dumped in dumps:
+        assert np.isnan(dumped.arrays["state/centroids"][0, 0]), "the state is that before the push"
+        assert int(dumped.arrays["scene"]) == SICK and int(dumped.arrays["branch"]) == 0
+        assert dumped.path.name == f"step-{int(dumped.arrays['env_steps']):06d}-scene-{SICK}.npz"
+        assert dumped.config == trainer.config and dumped.hull_bank_hash == "hulls"
+    assert len({int(dumped.arrays["env_steps"]) for dumped in dumps}) == len(dumps)
+
+
+def collect_poisoned(path: Path, steps: int, **options: Any) -> tuple[Trainer, list[str]]:
+    """Train with a poisoned scene in every step, each of which is reported; return what was said of it."""
+    said = io.StringIO()
+    trainer = make_trainer(path, make_config(log_every=3), env=FrailEnv(), said=said, **options)
+    left = iter(range(steps))
+
+    def poison_every_step() -> bool:
+        trainer.state = dataclasses.replace(trainer.state, actors=poison(trainer.state.actors))
+        return next(left, None) is None
+
+    with trainer.folder:
+        trainer.run(poison_every_step)
+    return trainer, [line for line in said.getvalue().splitlines() if "no dump" in line or "replay-dump" in line]
+
+
+def test_a_run_writes_no_more_than_so_many_dumps(tmp_path, monkeypatch):
+    monkeypatch.setattr(dump, "MAX_DUMPS", 2)
+    trainer, said = collect_poisoned(tmp_path / "run", 4)
+    names = sorted(path.name for path in trainer.folder.dumps.iterdir())
+    assert names == ["step-000003-scene-1.npz", "step-000006-scene-1.npz"]
+    assert said == [
+        f"the physics diverged at step {step} in scene 1; `python -m pregrasp_jax replay-dump "
+        f"{trainer.folder.dumps / name}` repeats the push"
+        for step, name in zip((3, 6), names, strict=True)
+    ]
+    assert sum(row.get("physics/diverged", 0) for row in rows(trainer.folder.path)) == 4, "all are counted"
+    mishap = trainer.state.actors.mishap.replace(scene=jnp.int32(1))
+    assert trainer.dump_fn(trainer.folder.dumps, mishap.replace(env_steps=jnp.int32(9))) is None
+    again = trainer.dump_fn(trainer.folder.dumps, mishap.replace(env_steps=jnp.int32(6)))
+    assert again == trainer.folder.dumps / names[1], "a resumed run writes what it wrote before"
+
+
+def test_a_dump_that_does_not_fit_is_one_warning_and_leaves_no_half(tmp_path, monkeypatch):
+    def full(file: Any, **_: Any) -> None:
+        file.write(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    trainer, said = collect_poisoned(tmp_path / "run", 2)
+    path = tmp_path / "run"
+    assert said == [
+        f"warning: no dump written at step {step} (No space left on device: {path}); the last checkpoint is of step 0"
+        for step in (3, 6)
+    ]
+    assert not list(trainer.folder.dumps.iterdir()) and len(rows(path)) == 2
