@@ -1,6 +1,7 @@
 """Command lines: what they accept, print and write."""
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from scripts import load_script
 from pregrasp_jax import __main__ as main_module
 from pregrasp_jax.checkpoint import save_policy
 from pregrasp_jax.cli import commands, doctor, film, player, progress
+from pregrasp_jax.cli.evaluate import evaluate
 from pregrasp_jax.cli.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.config import PRESETS, AssetsConfig, Config, PhysicsConfig, SceneConfig, TaskConfig
 from pregrasp_jax.learning.networks import QNetwork
@@ -93,10 +95,19 @@ def fake_world(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
 @pytest.mark.parametrize("name", ["straight", "random", "lookahead"])
 def test_a_script_is_evaluated_by_name(fake_world: list[Config], name: str) -> None:
     request = EvaluationConfig(policy=name, episodes=6, seed=2)
-    document = run_evaluation(request, make_player(request))
+    said: list[str] = []
+    document = run_evaluation(request, make_player(request), say=said.append)
+    assert said[0] == "compiling ..." and re.fullmatch(r"compiled in \d+\.\d s", said[1]) and len(said) == 2
     assert document["policy"] == name and len(document["rows"]) == 6
     assert document["hull_bank_hash"] == "hulls" and document["scene_bank_hash"] == "scenes"
     assert json.loads(json.dumps(document, allow_nan=False)) == document
+
+
+def test_evaluate_py_says_that_it_compiles_before_the_first_episode(fake_world: list[Config], capsys: Any) -> None:
+    evaluate(EvaluationConfig(policy="straight", episodes=2))
+    out, err = capsys.readouterr()
+    assert out.startswith("straight on 2 seen scenes")
+    assert [line.split()[0] for line in err.splitlines()] == ["compiling", "compiled", "episode"]
 
 
 def test_a_trained_policy_keeps_its_task_and_meets_everybodys_scenes(fake_world: list[Config], tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.training import collect, program
+from pregrasp_jax.training.mishap import NONE
 from pregrasp_jax.types import MAX_OBJECTS, OPEN, REASONS, SceneParams
 
 ROOT = Path(__file__).parent.parent
@@ -96,7 +97,11 @@ def test_a_scene_that_diverges_ends_alone_is_counted_and_starts_anew(training):
     state = training.before.replace(actors=training.before.actors.replace(env_states=broken))
     after = training.iterate(jax.tree.map(jnp.copy, state), np.zeros(2, np.int32), np.zeros(2, np.float32))
     report = collect.report(after.actors.tally)
-    assert report["reasons/nan"] == 1 and report["episodes"] >= 1
+    assert report["reasons/nan"] == 1 and report["physics/diverged"] == 1 and report["episodes"] >= 1
+    kept, before = after.actors.mishap, state.actors.env_states.physics
+    assert (int(kept.scene), int(kept.branch), int(kept.env_steps)) == (0, 0, 2) and bool(kept.seen.diverged)
+    np.testing.assert_array_equal(kept.state.physics.qpos, before.qpos[0])
+    assert int(training.after.actors.mishap.action) == NONE
     recovered, healthy = after.actors.env_states, training.after.actors.env_states
     assert np.isfinite(recovered.physics.qpos).all() and not recovered.physics.diverged.any()
     assert recovered.num_pushes[0] == 1, "it ended in the first iteration and was pushed anew in the second"

@@ -125,6 +125,18 @@ def test_a_diverged_scene_is_reported_alone_and_stays_diverged(engine, scenes, t
     np.testing.assert_array_equal(again.diverged, [True, False])
 
 
+def test_how_a_scene_diverges_does_not_depend_on_when_others_are_through(engine, scenes):
+    """The host runs the rows up to where the first scene is through, then the rest."""
+    scene = packed_scene(scenes, 0)
+    sick = engine.reset(engine.init(), dataclasses.replace(scene, poses=scene.poses.at[0, 0].set(jnp.nan)))
+    planned = plan(jnp.asarray(robot.home_joint_pos()[:6]), robot.START_POSE[:2], (-0.25, 0.0))
+    alone = engine.run(sick, planned.ctrl, jnp.int32(20))
+    both = jax.tree.map(lambda *x: jnp.stack(x), sick, engine.reset(engine.init(), scene))
+    beside = jax.vmap(lambda state, rows: engine.run(state, planned.ctrl, rows))(both, jnp.array([20, 3]))
+    np.testing.assert_array_equal(beside.bits[0], alone.bits)
+    np.testing.assert_array_equal(beside.diverged, [True, False])
+
+
 def test_too_deep_and_too_fast_end_a_scene_and_nothing_else_does(engine, scenes):
     """15 mm deep in the table is not too deep, and what is too deep counts though it is pressed out at once."""
     states = [engine.reset(engine.init(), packed_scene(scenes, 0)) for _ in range(5)]
@@ -155,7 +167,7 @@ def test_coordinates_put_a_scene_into_the_same_place(engine, scenes):
         packed
     )
     again = jax.vmap(lambda s: engine.place(s.object_ids, *engine.coordinates(s)))(states)
-    for old, new in zip(*(jax.tree.leaves(engine.observe(s)) for s in (states, again)), strict=True):
+    for old, new in zip(*(jax.tree.leaves(jax.vmap(engine.observe)(s)) for s in (states, again)), strict=True):
         np.testing.assert_array_equal(old, new)
     for old, new in zip(*(jax.vmap(engine.coordinates)(s) for s in (states, again)), strict=True):
         np.testing.assert_array_equal(old, new)

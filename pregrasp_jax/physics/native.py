@@ -88,7 +88,10 @@ class Simulations:
         self._loaded[sims] = wanted
 
     def run(self, state: np.ndarray, object_ids: np.ndarray, ctrl: np.ndarray, num_ctrl: np.ndarray) -> Any:
-        """Advance E scenes by `num_ctrl` control rows each; scenes that are through leave the stepped set.
+        """Advance E scenes by `num_ctrl` control rows each.
+
+        Scenes that are through leave the stepped set, and so do those that fail, lest how they end depends on when
+        others are through.
 
         Args:
             state: [E, nstate] float64.
@@ -109,7 +112,9 @@ class Simulations:
             failed, deep = np.zeros((2, num_scenes), bool)
             start = 0
             for stop in np.unique(num_ctrl[num_ctrl > 0]):
-                ids = np.flatnonzero(num_ctrl >= stop)
+                ids = np.flatnonzero((num_ctrl >= stop) & ~failed)
+                if ids.size == 0:
+                    break
                 rows = slice(start * self.num_substeps, stop * self.num_substeps)
                 nearest = np.zeros((len(ids), rows.stop - rows.start, 1))
                 out: dict[Any, np.ndarray] = {"sensordata": nearest}
@@ -118,12 +123,11 @@ class Simulations:
                 except SimulationError as error:
                     failed[error.ids] = True
                 deep[ids] |= nearest.min(axis=(1, 2)) < -MAX_PENETRATION
+                failed |= batch.warning[:num_scenes].any(axis=(1, 2))
                 start = stop
             new_state = batch.state[:num_scenes].copy()
             speed = np.abs(batch.bind("qvel")[:num_scenes]).max(axis=1)
-            warned = batch.warning[:num_scenes].any(axis=(1, 2))
-        senseless = deep | ~(speed < MAX_SPEED) | ~np.isfinite(new_state).all(axis=1)
-        return new_state, failed | warned | senseless
+        return new_state, failed | deep | ~(speed < MAX_SPEED) | ~np.isfinite(new_state).all(axis=1)
 
     def describe(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return object poses [E, MAX_OBJECTS, 7] and joint positions [E, 8] float32 of states [E, nstate]."""
