@@ -128,8 +128,8 @@ POLICIES = [
 ]
 
 DUMPS = [
-    ("pregrasp_jax replay-dump", "Missing from", "DUMP"),
-    ("pregrasp_jax replay-dump {w}/others.npz --engine warp", "Expected one of ('None', 'native', 'mjx')"),
+    ("pregrasp_jax replay-dump", "Missing from", "PATH file that train.py wrote to RUN_DIR/dumps"),
+    ("pregrasp_jax replay-dump {w}/others.npz --engine warp", "invalid choice 'warp'", "'native'"),
     ("pregrasp_jax replay-dump {w}/others.npz --png {w}", "{w} is a folder; allowed is the name of a file"),
     (
         "pregrasp_jax replay-dump {w}/nothing",

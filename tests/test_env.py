@@ -246,8 +246,14 @@ def test_pushes_follow_one_another_in_one_trace(pushes):
 
 
 def test_grasp_holds_the_target_between_the_fingers_and_nothing_else(env, pushes):
-    """The target below the table is pressed out of it by as much as a grasped one is lifted."""
-    before = stack([pushes.before[name] for name in CASES])
+    """A target that was thrown is 6 m above the table by then, higher than a grasped one is lifted."""
+    states = [pushes.before[name] for name in CASES]
+    thrown = pushes.before["towards the target"]
+    qpos, qvel = env.engine.coordinates(thrown.physics)
+    upwards = qvel.at[10 + 6 * TARGET + 2].set(40.0)
+    physics = env.engine.place(thrown.scene.object_ids, qpos, upwards)
+    states[list(CASES).index("too long, and below the table")] = thrown.replace(physics=physics)
+    before = stack(states)
     held = unstack(jax.jit(jax.vmap(env.grasp))(before), CASES)
     del held["target between the fingers after the push"]  # at the tips, where a round can is held by luck
     expected = {name: CASES[name].target == CAN_AT_PALM for name in held}
