@@ -1,6 +1,6 @@
 """Where the time of a training goes, stage by stage; prints one JSON object.
 
-    python benchmarks/train.py [--preset cpu] [--scenes-packed 64]
+    python benchmarks/train.py [--preset cpu] [any option of train.py, for example --network.architecture paper]
 
 Stages are compiled alone and timed on states and a memory met on the way. `ms_per_env_step` spreads each over the
 pushes it serves: a checkpoint over the steps between two of them, an update over `1 / updates_per_step`.
@@ -10,7 +10,6 @@ import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
 
 # isort: split
 import argparse
-import dataclasses
 import json
 import os
 import tempfile
@@ -20,6 +19,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import tyro
 from timing import best_ms
 
 from pregrasp_jax.checkpoint.state import save
@@ -117,17 +117,9 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", choices=sorted(PRESETS), default="cpu", help="configuration that is profiled")
-    parser.add_argument("--scenes-packed", type=int, default=64, help="training scenes to pack, few to be quick")
-    parser.add_argument("--capacity", type=int, help="observations in the memory instead of the preset's")
-    arguments = parser.parse_args()
-    config = PRESETS[arguments.preset]
-    capacity = arguments.capacity or config.replay.capacity
-    config = dataclasses.replace(
-        config,
-        scene=dataclasses.replace(config.scene, train_scenes=arguments.scenes_packed),
-        replay=dataclasses.replace(config.replay, capacity=capacity),
-    )
-    print(json.dumps(measure(config), indent=2))
+    arguments, options = parser.parse_known_args()
+    config = tyro.cli(Config, default=PRESETS[arguments.preset], args=options, config=(tyro.conf.FlagConversionOff,))
+    print(json.dumps(measure(config.validate()), indent=2))
 
 
 if __name__ == "__main__":

@@ -36,18 +36,10 @@ def test_negative_values_are_not_replaced_by_a_masked_zero():
 def test_empty_half_ring_is_worth_nothing():
     empty = jnp.zeros((H, W), bool)
     assert float(learner.max_q(Q, empty)) == 0.0
-    assert float(learner.next_value(Q, empty, Q)) == 0.0
     assert int(learner.greedy_action(Q, empty)) == 0
     with jax.debug_nans(True):
         grad = jax.grad(lambda q: learner.max_q(q, empty))(Q)
     np.testing.assert_array_equal(grad, jnp.zeros_like(Q))
-
-
-def test_double_q_values_the_online_choice_with_the_target_network():
-    mask = jnp.ones((H, W), bool).at[0, 1].set(False)
-    online = jnp.zeros_like(Q).at[0, 1, 1].set(100.0).at[1, 2, 0].set(10.0)
-    assert float(learner.next_value(Q, mask)) == 8.0
-    assert float(learner.next_value(Q, mask, online)) == -2.0
 
 
 @pytest.mark.parametrize(
@@ -163,8 +155,6 @@ def test_targets_come_from_the_target_network():
     options = {"apply_fn": tabular, "mask_fn": first_row, "optimizer": optimizer}
     _, errors, _ = learner.update(state, make_batch([0], [0]), **options)
     assert float(errors[0]) == -4.5
-    _, errors, _ = learner.update(state, make_batch([0], [0]), **options, double_q=True)
-    assert float(errors[0]) == -0.5 * 1.0  # the online network, all zeros, chooses the first cell
 
 
 def test_adam_and_polyak_are_what_the_paper_names():

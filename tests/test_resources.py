@@ -12,7 +12,7 @@ def test_what_a_run_needs_is_estimated(tmp_path, monkeypatch):
     resources.check(rest, ring, tmp_path / "new" / "run")
     assert not (tmp_path / "new").exists()
     monkeypatch.setattr(resources, "available_memory", lambda: 10**6)
-    with pytest.raises(ValueError, match=r"needs about 0.5\d GB of memory, 0.00 GB are free; a smaller replay.capac"):
+    with pytest.raises(ValueError, match=r"needs about 1.0\d GB of memory, 0.00 GB are free; a smaller replay.capac"):
         resources.check(rest, ring, tmp_path)
 
 

@@ -159,7 +159,10 @@ def draw_replay(env: Env, mishap: Mishap, replay: Replay) -> np.ndarray:
 
 
 def _watch(env: Env, run: Callable[..., Any], physics: Any, plan: Plan, num_ctrl: int) -> np.ndarray:
-    """Run one row after the other; see `Replay.speeds`."""
+    """Run one row after the other; see `Replay.speeds`.
+
+    The `native` engine wakes what sleeps whenever it is called, so the last digits are not those of the whole push.
+    """
     rows, speeds = np.arange(len(plan.ctrl)), []
     for row in range(num_ctrl):
         physics = run(physics, plan.ctrl[np.minimum(row + rows, rows[-1])], jnp.int32(1))

@@ -63,11 +63,13 @@ def greedy_action(q: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def max_q(q: jax.Array, mask: jax.Array) -> jax.Array:
-    """Return the value () of the best allowed push; 0 if the mask is empty.
+    """Return the value () of the best allowed push, hence of a state; 0 if the mask is empty.
 
     Args:
         q: [H, W, 2].
         mask: [H, W] bool.
+
+    Source: Eq. 3.
     """
     return jnp.where(jnp.any(mask), jnp.max(_mask(q, mask)), 0.0)
 
@@ -75,21 +77,6 @@ def max_q(q: jax.Array, mask: jax.Array) -> jax.Array:
 def _mask(q: jax.Array, mask: jax.Array) -> jax.Array:
     assert q.ndim == 3 and q.shape[:2] == mask.shape, f"expected [H, W, 2] and [H, W], got {q.shape}, {mask.shape}"
     return jnp.where(mask[..., None], q, -jnp.inf)
-
-
-def next_value(q_target: jax.Array, mask: jax.Array, q_online: jax.Array | None = None) -> jax.Array:
-    """Return the value () of the next state; 0 if the half ring holds no cell.
-
-    Args:
-        q_target: [H, W, 2] of the target network.
-        mask: [H, W] bool.
-        q_online: [H, W, 2] of the online network, which then chooses the push that `q_target` values (double Q).
-
-    Source: Eq. 3; van Hasselt et al. 2016 for double Q.
-    """
-    if q_online is None:
-        return max_q(q_target, mask)
-    return jnp.where(jnp.any(mask), q_target.ravel()[greedy_action(q_online, mask)], 0.0)
 
 
 def td_target(reward: jax.Array, terminated: jax.Array, value: jax.Array, *, discount: float) -> jax.Array:
@@ -133,7 +120,6 @@ def update(
     discount: float = 0.5,
     polyak: float = 0.999,
     huber_delta: float = 0.1,
-    double_q: bool = False,
 ) -> tuple[LearnerState, jax.Array, dict[str, jax.Array]]:
     """Take one gradient step.
 
@@ -147,13 +133,12 @@ def update(
         discount: gamma.
         polyak: share of the target network that is kept.
         huber_delta: where the loss turns linear.
-        double_q: let the online network choose the next push.
 
     Returns:
         The next state, TD errors [B] (signed) for the priorities, and metrics () each.
     """
     q_at = q_at_fn or gather_q(apply_fn)
-    targets = _targets(state, batch, apply_fn=apply_fn, mask_fn=mask_fn, discount=discount, double_q=double_q)
+    targets = _targets(state, batch, apply_fn=apply_fn, mask_fn=mask_fn, discount=discount)
 
     def loss_fn(params: Params) -> tuple[jax.Array, jax.Array]:
         errors = jax.vmap(td_error)(q_at(params, batch.inputs, batch.action), targets)
@@ -208,16 +193,10 @@ def learn(
     return state, replay, metrics
 
 
-def _targets(
-    state: LearnerState, batch: Batch, *, apply_fn: ApplyFn, mask_fn: MaskFn, discount: float, double_q: bool
-) -> jax.Array:
+def _targets(state: LearnerState, batch: Batch, *, apply_fn: ApplyFn, mask_fn: MaskFn, discount: float) -> jax.Array:
     """Return y [B]."""
     masks = jax.vmap(mask_fn)(batch.next_p1)
-    q_target = apply_fn(state.target_params, batch.next_inputs)
-    if double_q:
-        values = jax.vmap(next_value)(q_target, masks, apply_fn(state.params, batch.next_inputs))
-    else:
-        values = jax.vmap(next_value)(q_target, masks)
+    values = jax.vmap(max_q)(apply_fn(state.target_params, batch.next_inputs), masks)
     return jax.vmap(lambda r, t, v: td_target(r, t, v, discount=discount))(batch.reward, batch.terminated, values)
 
 

@@ -64,8 +64,8 @@ class Simulations:
         self._allocate(1)
 
     def _allocate(self, num_scenes: int) -> None:
-        self._batch = Batch(self.model.mj_model, num_scenes, self._threads)
-        names = (*slot_model.GEOM_FIELDS, *slot_model.BODY_FIELDS, slot_model.RBOUND)
+        self._batch = Batch(self.model.mj_model, num_scenes, self._threads, persistent=True)  # for sleep
+        names = (*slot_model.GEOM_FIELDS, *slot_model.BODY_FIELDS, slot_model.RBOUND, "dof_length")
         self._expanded = {name: self._batch.expand(name) for name in names}
         self._loaded = np.full((num_scenes, MAX_OBJECTS), -1)
 
@@ -84,7 +84,9 @@ class Simulations:
         wanted = object_ids[sims]
         slot_model.write_batch_slots(self.model, self._expanded, sims, wanted)
         self._batch.set_const(sims)
+        # Two derived constants that come out wrong, because they belong to the meshes that were compiled.
         slot_model.write_batch_fields(self.model, self._expanded, sims, wanted, [slot_model.RBOUND])
+        self._expanded["dof_length"][sims] = self.model.mj_model.dof_length
         self._loaded[sims] = wanted
 
     def run(self, state: np.ndarray, object_ids: np.ndarray, ctrl: np.ndarray, num_ctrl: np.ndarray) -> Any:
@@ -106,6 +108,8 @@ class Simulations:
         with self._lock:
             self.load(object_ids)
             batch, num_scenes = self._batch, len(state)
+            # Who sleeps is no part of the state: everything is awake at first, whatever was simulated before.
+            batch.reset(np.arange(num_scenes))
             batch.state[:num_scenes] = state
             batch.warning[:num_scenes] = 0
             fine = _interpolate(ctrl, self.num_substeps)
@@ -168,6 +172,24 @@ def _from_bits(bits: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(bits).view(np.float64)
 
 
+def load_spec() -> mujoco.MjSpec:
+    """Return the robot at its table, with objects at rest left out of the computation until something touches them.
+
+    A sensor tells the signed distance, m, in the deepest contact (0: none). It costs a hundredth of a step and changes
+    no bit of the state.
+    """
+    spec = robot.load_spec()
+    spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+    spec.add_sensor(
+        name="deepest contact",
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_UNKNOWN,
+        reftype=mujoco.mjtObj.mjOBJ_UNKNOWN,
+        intprm=[1 << mujoco.mjtConDataField.mjCONDATA_DIST.value, _SMALLEST_DISTANCE, 1],
+    )
+    return spec
+
+
 def make_engine(bank: HullBank, *, threads: int = 0, model: SlotModel | None = None) -> Engine:
     """Compile the slot model of `bank` and return the engine; it owns its simulations.
 
@@ -176,7 +198,7 @@ def make_engine(bank: HullBank, *, threads: int = 0, model: SlotModel | None = N
         threads: 0 takes every core; results do not depend on it.
         model: a slot model of other hulls or options for the same objects.
     """
-    simulations = Simulations(model or _make_model(bank), threads=threads)
+    simulations = Simulations(model or slot_model.make_slot_model(load_spec(), bank), threads=threads)
     mj_model = simulations.model.mj_model
     shapes = NativeState(
         *(
@@ -253,19 +275,3 @@ def make_engine(bank: HullBank, *, threads: int = 0, model: SlotModel | None = N
         return callback(host_place, shapes, object_ids, qpos, qvel)
 
     return Engine("native", init, reset, run, observe, coordinates, place)
-
-
-def _make_model(bank: HullBank) -> SlotModel:
-    """Return the slot model of the arm, with a sensor of the signed distance, m, in the deepest contact (0: none).
-
-    It costs a hundredth of a step and changes no bit of the state.
-    """
-    spec = robot.load_spec()
-    spec.add_sensor(
-        name="deepest contact",
-        type=mujoco.mjtSensor.mjSENS_CONTACT,
-        objtype=mujoco.mjtObj.mjOBJ_UNKNOWN,
-        reftype=mujoco.mjtObj.mjOBJ_UNKNOWN,
-        intprm=[1 << mujoco.mjtConDataField.mjCONDATA_DIST.value, _SMALLEST_DISTANCE, 1],
-    )
-    return slot_model.make_slot_model(spec, bank)

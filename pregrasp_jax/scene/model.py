@@ -26,6 +26,9 @@ BODY_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_gra
 RBOUND = "geom_rbound"
 """`mj_setConst` puts this one back to the compiled mesh's radius, so it is written after it, never before."""
 
+_ROTATION_LENGTH = 0.15
+"""m; speed of an object's outside per rad/s, by which `sleep` decides: one for all, though objects differ."""
+
 _PARKED_MASS = 0.1
 _PARKING = (0.0, -3.0, -1.0)
 """m; empty slots wait here without weight and without contacts, out of every camera's view."""
@@ -71,13 +74,14 @@ def make_slot_model(spec: mujoco.MjSpec, bank: HullBank) -> SlotModel:
     bodies = [mj_model.body(f"slot_{i}") for i in range(MAX_OBJECTS)]
     geoms = [[mj_model.geom(_geom_name(i, j)).id for j in range(MAX_HULLS)] for i in range(MAX_OBJECTS)]
     qpos = np.array([mj_model.jnt_qposadr[b.jntadr[0]] for b in bodies])
-    dofs = np.array([b.dofadr[0] for b in bodies])
+    dofs = np.array([b.dofadr[0] for b in bodies])[:, None] + np.arange(6)
+    mj_model.dof_length[dofs[:, 3:]] = _ROTATION_LENGTH
     model = SlotModel(
         mj_model=mj_model,
         slot_body_ids=np.array([b.id for b in bodies]),
         slot_geom_ids=np.array(geoms),
         slot_qpos_ids=qpos[:, None] + np.arange(7),
-        slot_dof_ids=dofs[:, None] + np.arange(6),
+        slot_dof_ids=dofs,
         fields=_tabulate(mj_model, bank),
     )
     write_slots(model, mj_model, np.full(MAX_OBJECTS, -1))

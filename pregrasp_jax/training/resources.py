@@ -11,8 +11,8 @@ from pregrasp_jax.checkpoint.state import KEEP
 COMPRESSED = 0.25
 """Share of the observations' bytes that their chunks take on disk; 0.1 was measured on clutter."""
 
-WORKING_MEMORY = 500e6
-"""Bytes for compiled programs, the scene bank and a chunk on its way to disk."""
+WORKING_MEMORY = 1e9
+"""Bytes for compiled programs, the scene bank and a chunk on its way to disk (1.1e9 measured, with libraries)."""
 
 _MEMINFO = Path("/proc/meminfo")
 _CGROUP = Path("/sys/fs/cgroup")
