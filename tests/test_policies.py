@@ -169,11 +169,10 @@ def test_lookahead_ranks_success_then_distance_then_failure() -> None:
     ]
     rows, cols = zip(*(grid.world_to_cell(jnp.array(xy)) for xy, _ in pushes), strict=True)
     actions = grid.encode_action(jnp.stack(rows), jnp.stack(cols), jnp.array([aperture for _, aperture in pushes]))
-    search = policies._advance(env, policies._start_search(env.reset_to(0), 4), actions, jnp.ones(4, bool))
-    assert search.held.tolist() == [True, False, False, False]
-    assert search.ended.tolist() == [True, False, False, True]
-    near, far, failure = search.values[1:].tolist()
-    assert 0 > near > far > failure
+    plans = policies._advance(env, policies._start(env.reset_to(0), 4), actions)
+    assert plans.ended.tolist() == [True, False, False, True]
+    success, near, far, failure = plans.values.tolist()
+    assert success > 0 > near > far > failure
 
 
 @dataclass(frozen=True)
