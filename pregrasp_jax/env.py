@@ -85,19 +85,24 @@ class Env:
         yaw, target = jnp.asarray(self.scenes.yaw)[index], jnp.asarray(self.scenes.target)[index]
         return self.start(self._scene(index, yaw, target), index)
 
-    def step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, StepResult]:
+    def step(
+        self, state: EnvState, action: jax.Array, *, execute: jax.Array | bool = True
+    ) -> tuple[EnvState, StepResult]:
         """Push, look, judge.
 
         Args:
             state: a running scene.
             action: () int32 flat index of Q[row, col, aperture]; it need not lie in the half ring.
+            execute: () bool; False refuses the push as if it were out of reach, which costs no physics. For searches
+                that are through with one scene of a batch.
 
         Returns:
             The next state, which is never reset here, and what the push did.
         """
         plan = self.plan(state, action)
-        physics = self.engine.run(state.physics, plan.ctrl, jnp.where(plan.reachable, plan.num_ctrl, 0))
-        return self.conclude(state, action, plan.reachable, physics)
+        executed = plan.reachable & execute
+        physics = self.engine.run(state.physics, plan.ctrl, jnp.where(executed, plan.num_ctrl, 0))
+        return self.conclude(state, action, executed, physics)
 
     def plan(self, state: EnvState, action: jax.Array) -> primitives.Plan:
         """Return the motion of a push, reachable or not; see `step`."""
@@ -137,8 +142,11 @@ class Env:
         """Return the cells [H, W] bool in which the next push may end."""
         return primitives.half_ring_mask(p1, r_in=self.task.r_in, r_out=self.task.r_out, full_ring=self.task.full_ring)
 
-    def grasp(self, state: EnvState) -> jax.Array:
-        """Close with constant force, lift 0.2 m, hold 5 s; return whether the target stayed between the fingers."""
+    def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> jax.Array:
+        """Close with constant force, lift 0.2 m, hold 5 s; return whether the target stayed between the fingers.
+
+        Without `execute` () bool it did not, at no cost.
+        """
         times = CTRL_DT * jnp.arange(round((CLOSE_TIME + LIFT_HEIGHT / LIFT_SPEED + HOLD_TIME) / CTRL_DT))
         lift = LIFT_HEIGHT * primitives.minimum_jerk((times - CLOSE_TIME) / (LIFT_HEIGHT / LIFT_SPEED))
         xy = jnp.broadcast_to(state.p1, (len(times), 2))
@@ -146,7 +154,7 @@ class Env:
         arm, ok = primitives.plan_arm(state.physics_obs.joint_pos[:6], positions)
         fingers = jnp.full((len(times), 1), robot.FINGER_CLOSED)
         ctrl = jnp.concatenate([arm, fingers], axis=1)
-        physics = self.engine.run(state.physics, ctrl, jnp.where(jnp.all(ok), len(times), 0))
+        physics = self.engine.run(state.physics, ctrl, jnp.where(jnp.all(ok) & execute, len(times), 0))
         after = self.engine.observe(physics)
         target = state.scene.target
         rise = after.object_poses[target, 2] - state.physics_obs.object_poses[target, 2]

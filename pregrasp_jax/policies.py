@@ -9,6 +9,7 @@ to what the camera sees.
 from collections.abc import Callable
 from typing import Any
 
+import flax.struct as struct
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
@@ -28,11 +29,11 @@ CLEAR_DISTANCE = 0.13
 LOOKAHEAD_CANDIDATES = 20
 """First pushes that `lookahead` tries."""
 
-LOOKAHEAD_CONTINUATION = 2
-"""`straight` pushes that follow each candidate in its simulation."""
+LOOKAHEAD_CONTINUATION = 3
+"""Pushes that may follow each candidate in its simulation."""
 
-_FAILURE = -10.0
-"""What a failed push is worth to `lookahead`, below every distance."""
+_SUCCESS, _FAILURE = 10.0, -10.0
+"""What a grasp that holds and a failed push are worth to `lookahead`, above and below minus every distance."""
 
 _GUIDED = {"angle_std": 0.5, "open_probability": 0.7}
 """`ExplorationConfig`'s defaults: the `guided` policy is what exploration looks like at epsilon 1."""
@@ -83,55 +84,116 @@ def make_clear(env: Env) -> Policy:
 
 
 def make_lookahead(env: Env, *, num_candidates: int = LOOKAHEAD_CANDIDATES) -> Policy:
-    """Return the upper bound: try candidate pushes in simulation, execute the first of the best.
+    """Return the upper bound: search a plan in simulation, execute its first push.
 
-    The candidates are one `straight` push and, half and half, `guided` and `random` ones; each is followed by
-    up to `LOOKAHEAD_CONTINUATION` `straight` pushes. Because `straight` is among them, a plan that was found
-    once is not lost at the next decision. Best is the earliest success, then the smallest distance to the
-    target, then failure. Only the candidate itself can fail: where a continuation would, the hand stops before
-    it (0.94 against 0.88 success on 16 scenes when failing continuations condemn their candidate).
+    The candidates for the first push are one each of `straight` and `clear` and, half and half, `guided` and
+    `random` ones. They are continued by turns by `straight` and by `clear`, all of them one push at a time, until
+    the first plan encloses the target and its grasp holds, or `LOOKAHEAD_CONTINUATION` pushes have followed. Physics
+    repeats itself and each of the two scripts is itself a candidate that it continues, so that a plan which was
+    found once is carried out, unless a shorter one turns up. Without a plan the candidate is best that leads
+    nearest to the target. Only the candidate itself can fail: where a continuation would, the hand stops before it
+    (0.94 against 0.88 success on 16 scenes when failing continuations condemn their candidate). docs/task.md has
+    what each of these was worth.
 
     Args:
         env: simulates the candidates. Give it an engine of its own: a vmapped decision steps
             `num_candidates` times as many scenes as the evaluation does.
-        num_candidates: at least 3.
+        num_candidates: at least 4.
     """
-    guided, uniform, straight = make_guided(env), make_random(env), make_straight(env)
-    num_guided = (num_candidates - 1) // 2
+    guided, uniform, straight, clear = make_guided(env), make_random(env), make_straight(env), make_clear(env)
+    num_guided = (num_candidates - 2) // 2
 
-    def continuation_value(state: EnvState, action: jax.Array, key: jax.Array) -> jax.Array:
-        state, value, ended = _push(env, state, action, 0)
-        for depth in range(1, 1 + LOOKAHEAD_CONTINUATION):
-            state, next_value, next_ended = _push(env, state, straight(state, key), depth)
-            value = jnp.where(ended | (next_value == _FAILURE), value, next_value)
-            ended |= next_ended
-        return value
-
-    def act(state: EnvState, key: jax.Array) -> jax.Array:
-        keys = jax.random.split(key, num_candidates - 1)
-        actions = jnp.concatenate(
+    def candidates(state: EnvState, key: jax.Array) -> jax.Array:
+        keys = jax.random.split(key, num_candidates - 2)
+        return jnp.concatenate(
             [
-                straight(state, key)[None],
+                jnp.stack([straight(state, key), clear(state, key)]),
                 jax.vmap(guided, (None, 0))(state, keys[:num_guided]),
                 jax.vmap(uniform, (None, 0))(state, keys[num_guided:]),
             ]
         )
-        values = jax.vmap(continuation_value, (None, 0, None))(state, actions, key)
-        return actions[jnp.argmax(values)]
+
+    def continuation(states: EnvState, key: jax.Array) -> jax.Array:
+        by_turns = [jax.vmap(script, (0, None))(states, key) for script in (straight, clear)]
+        return jnp.where(jnp.arange(num_candidates) % 2 == 0, *by_turns)
+
+    def act(state: EnvState, key: jax.Array) -> jax.Array:
+        first = candidates(state, key)
+
+        def advance(plans: _Plans) -> _Plans:
+            actions = jnp.where(plans.depth == 0, first, continuation(plans.states, key))
+            return _advance(env, plans, actions)
+
+        plans = jax.lax.while_loop(_unfinished, advance, _start(state, num_candidates))
+        return first[jnp.argmax(plans.values)]
 
     return act
 
 
-def _push(env: Env, state: EnvState, action: jax.Array, depth: int) -> tuple[EnvState, jax.Array, jax.Array]:
-    """Return the next state, what ending there is worth to `lookahead`, and whether the episode ended there.
+class _Plans(struct.PyTreeNode):
+    """Candidates of one decision, each with what followed it so far.
 
-    A success is worth 10 less its `depth`, the metres still to go count between 0 and -1.
+    Attributes:
+        depth: () int32 pushes simulated.
+        states: where each candidate has led, [C, ...].
+        values: [C] `_SUCCESS` if the target was enclosed and held, else minus the metres between it and the hand at
+            the last state that was not a failure, or `_FAILURE`.
+        ended: [C] bool, nothing can follow.
     """
-    state, result = env.step(state, action)
-    distance = jnp.minimum(result.outcome.distance_after[state.scene.target], 1.0)
-    value = jnp.where(result.terminated, _FAILURE, -distance)
-    value = jnp.where(result.reason == TARGET_IN_REGION, 10.0 - depth, value)
-    return state, value, result.terminated | result.truncated
+
+    depth: jax.Array
+    states: EnvState
+    values: jax.Array
+    ended: jax.Array
+
+
+def _start(state: EnvState, num_candidates: int) -> _Plans:
+    states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_candidates, *jnp.shape(leaf))), state)
+    return _Plans(jnp.int32(0), states, jnp.zeros(num_candidates), jnp.zeros(num_candidates, bool))
+
+
+def _unfinished(plans: _Plans) -> jax.Array:
+    """Return whether there is something to simulate and no success yet, () bool."""
+    more = ~jnp.all(plans.ended) & (plans.depth <= LOOKAHEAD_CONTINUATION)
+    return more & ~jnp.any(plans.values == _SUCCESS)
+
+
+def _advance(env: Env, plans: _Plans, actions: jax.Array) -> _Plans:
+    """Push once more wherever that can still matter, and try the grasps which that makes possible.
+
+    In a batch the loop goes on until its last scene is through; the others must not cost physics meanwhile.
+    """
+    execute = ~plans.ended & _unfinished(plans)
+    states, results = jax.vmap(lambda state, action, go: env.step(state, action, execute=go))(
+        plans.states, actions, execute
+    )
+    held = _first_grasp(env, states, execute & (results.reason == TARGET_IN_REGION))
+    distance = jax.vmap(lambda outcome, target: outcome.distance_after[target])(results.outcome, states.scene.target)
+    failed = jnp.where(plans.depth == 0, _FAILURE, plans.values)
+    values = jnp.where(held, _SUCCESS, jnp.where(results.terminated, failed, -distance))
+    return _Plans(
+        depth=plans.depth + 1,
+        # No script looks at a picture: the old one spares drawing a new one.
+        states=states.replace(obs=plans.states.obs),
+        values=jnp.where(execute, values, plans.values),
+        ended=plans.ended | (execute & (results.terminated | results.truncated)),
+    )
+
+
+def _first_grasp(env: Env, states: EnvState, enclosed: jax.Array) -> jax.Array:
+    """Try grasps, one after the other, of the `enclosed` [C] bool; return [C] bool, the first that holds or none."""
+
+    def untried(carry: tuple[jax.Array, jax.Array]) -> jax.Array:
+        waiting, held = carry
+        return jnp.any(waiting) & ~jnp.any(held)
+
+    def grasp(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        waiting, held = carry
+        index = jnp.argmax(waiting)
+        state = jax.tree.map(lambda leaf: leaf[index], states)
+        return waiting.at[index].set(False), held.at[index].set(env.grasp(state, execute=untried(carry)))
+
+    return jax.lax.while_loop(untried, grasp, (enclosed, jnp.zeros_like(enclosed)))[1]
 
 
 def make_learned(

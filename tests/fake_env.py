@@ -85,9 +85,11 @@ class FakeEnv:
         distance = jnp.hypot(dx, dy)
         return (distance >= self.task.r_in - 1e-6) & (distance <= self.task.r_out + 1e-6) & (dx >= -1e-6)
 
-    def step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, StepResult]:
+    def step(
+        self, state: EnvState, action: jax.Array, *, execute: jax.Array | bool = True
+    ) -> tuple[EnvState, StepResult]:
         row, col, aperture = grid.decode_action(action)
-        reachable = row >= UNREACHABLE_ROWS
+        reachable = (row >= UNREACHABLE_ROWS) & execute
         p1 = jnp.where(reachable, grid.cell_to_world(row, col), state.p1)
         distance = jnp.linalg.norm(state.centroids - p1[None], axis=-1)
         present = state.scene.object_ids >= 0
@@ -109,8 +111,8 @@ class FakeEnv:
         next_state = state.replace(p1=p1, aperture=aperture, num_pushes=num_pushes)
         return next_state, StepResult(outcome, reward, terminated, truncated, reason)
 
-    def grasp(self, state: EnvState) -> jax.Array:
-        return state.scene_index % 2 == 0
+    def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> jax.Array:
+        return (state.scene_index % 2 == 0) & execute
 
 
 def fake_env(**fields: Any) -> Any:

@@ -1,12 +1,13 @@
 """Policies against brute force on the grid and hand-made worlds."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fake_env import UNREACHABLE_ROWS, fake_env, make_scenes
+from fake_env import UNREACHABLE_ROWS, FakeEnv, fake_env, make_scenes
 
 from pregrasp_jax import grid, policies
 from pregrasp_jax.config import TaskConfig
@@ -160,23 +161,46 @@ def test_lookahead_never_takes_a_failure_if_a_candidate_survives(key: jax.Array)
 
 def test_lookahead_ranks_success_then_distance_then_failure() -> None:
     env = _world([(-0.1525, 0.0025), (-0.2025, 0.0525), (0.2, 0.2)])
-
-    def value(xy: tuple[float, float], aperture: int, depth: int) -> float:
-        row, col = grid.world_to_cell(jnp.array(xy))
-        action = grid.encode_action(row, col, jnp.int32(aperture))
-        return float(policies._push(env, env.reset_to(0), action, depth)[1])
-
-    success, near, far = (-0.2025, 0.0525), (-0.2025, 0.0425), (-0.2025, -0.05)
-    failure = (-0.1525, 0.0025)
-    ranked = [
-        value(success, OPEN, 0),
-        value(success, OPEN, 2),
-        value(near, CLOSED, 2),
-        value(far, CLOSED, 0),
-        value(failure, OPEN, 0),
+    pushes = [
+        ((-0.2025, 0.0525), OPEN),  # encloses the target
+        ((-0.2025, 0.0425), CLOSED),  # near
+        ((-0.2025, -0.05), CLOSED),  # far
+        ((-0.1525, 0.0025), OPEN),  # encloses the obstacle
     ]
-    assert ranked == sorted(ranked, reverse=True)
-    assert len(set(ranked)) == len(ranked)
+    rows, cols = zip(*(grid.world_to_cell(jnp.array(xy)) for xy, _ in pushes), strict=True)
+    actions = grid.encode_action(jnp.stack(rows), jnp.stack(cols), jnp.array([aperture for _, aperture in pushes]))
+    plans = policies._advance(env, policies._start(env.reset_to(0), 4), actions)
+    assert plans.ended.tolist() == [True, False, False, True]
+    success, near, far, failure = plans.values.tolist()
+    assert success > 0 > near > far > failure
+
+
+@dataclass(frozen=True)
+class _Slippery(FakeEnv):
+    """Only an episode's second push leaves the target where it can be held."""
+
+    def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> jax.Array:
+        return (state.num_pushes == 2) & execute
+
+
+def test_lookahead_prefers_a_candidate_whose_grasp_holds(key: jax.Array) -> None:
+    scenes = make_scenes(1)
+    scenes.xy[0, :3], scenes.target[0] = [(0.2, -0.2), (-0.1525, 0.0025), (0.2, 0.2)], 1
+    env: Any = _Slippery(scenes=scenes)
+    state = env.reset_to(0)
+    assert int(env.step(state, policies.make_straight(env)(state, key))[1].reason) == TARGET_IN_REGION
+    lookahead = jax.jit(policies.make_lookahead(env))
+    state, _ = env.step(state, lookahead(state, key))
+    state, result = env.step(state, lookahead(state, key))
+    assert int(result.reason) == TARGET_IN_REGION and env.grasp(state)
+
+
+def test_lookahead_tries_grasps_until_one_holds() -> None:
+    # Even scenes hold; the first of them is not enclosed, the last is not reached.
+    states = jax.vmap(ENV.reset_to)(jnp.array([2, 1, 4, 6]))
+    enclosed = jnp.array([False, True, True, True])
+    assert policies._first_grasp(ENV, states, enclosed).tolist() == [False, False, True, False]
+    assert not policies._first_grasp(ENV, states, enclosed & False).any()
 
 
 def test_lookahead_forgives_a_failing_continuation(key: jax.Array) -> None:
