@@ -41,8 +41,10 @@ class PictureEnv(FakeEnv):
     def reset(self, key: jax.Array) -> EnvState:
         return self._draw(self.reset_to(jax.random.randint(key, (), 0, len(self.scenes))))
 
-    def step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, StepResult]:
-        next_state, result = super().step(state, action)
+    def step(
+        self, state: EnvState, action: jax.Array, *, execute: jax.Array | bool = True
+    ) -> tuple[EnvState, StepResult]:
+        next_state, result = super().step(state, action, execute=execute)
         return self._draw(next_state), result
 
     def _draw(self, state: EnvState) -> EnvState:
