@@ -104,9 +104,10 @@ def make_trainer(
     begin: bool = True,
     said: TextIO | None = None,
     env: Any = None,
+    folder: RunFolder | None = None,
 ) -> Trainer:
     built = make_program(config, env)
-    folder = RunFolder.open(path, config) if resume else RunFolder.create(path, config)
+    folder = folder or (RunFolder.open(path, config) if resume else RunFolder.create(path, config))
     trainer = Trainer(config, folder, built, evaluate, Console(said or io.StringIO()))
     if begin:
         (trainer.resume if folder.has_checkpoint else trainer.begin)()

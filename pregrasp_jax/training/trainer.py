@@ -14,7 +14,7 @@ from pregrasp_jax import exploration
 from pregrasp_jax.checkpoint import restore, save, save_policy
 from pregrasp_jax.config import Config
 from pregrasp_jax.learning.learner import Params
-from pregrasp_jax.training import collect, learn
+from pregrasp_jax.training import collect, learn, processes
 from pregrasp_jax.training.console import Console, format_time
 from pregrasp_jax.training.program import IterateFn, Program, TrainState
 from pregrasp_jax.training.run_folder import RunFolder
@@ -100,7 +100,7 @@ class Trainer:
         Raises:
             ValueError: it cannot be written, so no later one could.
         """
-        self.state = jax.jit(self.program.init)(jax.random.key(self.config.seed))
+        self.state = self.program.begin(jax.random.key(self.config.seed))
         if self.config.train.tensorboard:
             self.folder.begin_event_log()
         self.save()
@@ -114,10 +114,11 @@ class Trainer:
             ValueError: there is none, or it does not fit the configuration.
         """
         template, ring = self.program.shapes().split()
-        restored = restore(self.folder.checkpoints, template, ring)
+        with processes.first_goes_first("restore"):  # it sets damaged checkpoints aside
+            restored = restore(self.folder.checkpoints, template, ring)
         for problem in restored.problems:
             self.console.say(f"warning: {problem}; going on from the checkpoint of step {restored.step}")
-        self.state = restored.tree.join(restored.ring)
+        self.state = self.program.place(restored.tree.join(restored.ring))
         self.progress = Progress(**restored.extra)
         self.folder.forget_metrics_after(restored.step)
         if self.config.train.tensorboard:
@@ -139,15 +140,15 @@ class Trainer:
         program, seconds = self.program.compile(self.state)
         self.console.say(f"compiled in {seconds:.1f} s")
         self.console.start()
-        while progress.share_done(self.config) < 1.0:
-            if stop():
+        while processes.agreed(progress.share_done(self.config) < 1.0):
+            if processes.agreed(stop()):
                 return self._interrupted()
             self._step(program)
             if self._crossed(self.config.train.log_every):
                 self.log()
             if self._crossed(self.config.train.evaluate_every):
                 self.evaluate()
-            if progress.total_seconds - self._tried_to_save_at >= 60 * self.config.train.checkpoint_minutes:
+            if processes.agreed(self._seconds_unsaved >= 60 * self.config.train.checkpoint_minutes):
                 self.save()
         self.evaluate()
         self.save()
@@ -234,7 +235,8 @@ class Trainer:
         if progress.evaluated_at == progress.env_steps:
             return
         progress.evaluated_at = progress.env_steps
-        params = self.state.learning.learner.target_params  # the average is the better policy: it jumps less
+        # The average is the better policy: it jumps less. One device evaluates, in every process the same.
+        params = self.program.layout.one_copy(self.state.learning.learner.target_params)
         with progress.timed("evaluate"):
             measured = self.evaluate_fn(params)
         self._unsaved = True  # the best score is part of a checkpoint
@@ -254,7 +256,7 @@ class Trainer:
         if self.saved:
             return
         self._refuse_non_finite()
-        rest, _ = self.state.split()
+        rest = self.program.layout.gather(self.state.split()[0])
         ring, extra = self.state.ring(), dict(vars(progress))
         with progress.timed("checkpoint"):
             written = self._write(
@@ -262,7 +264,7 @@ class Trainer:
                 lambda: save(self.folder.checkpoints, progress.env_steps, rest, ring, extra),
             )
         self._tried_to_save_at = progress.total_seconds
-        if written:
+        if processes.agreed(written):
             self._saved_at, self._unsaved = progress.env_steps, False
 
     @property
@@ -272,6 +274,8 @@ class Trainer:
 
     def _write(self, what: str, write: Callable[[], object]) -> bool:
         """Write a file; a full disk is reported, and the training goes on. Return whether it was written."""
+        if not self.folder.writes:
+            return True
         try:
             write()
         except OSError as error:
@@ -282,6 +286,11 @@ class Trainer:
             )
             return False
         return True
+
+    @property
+    def _seconds_unsaved(self) -> float:
+        """Training time since a checkpoint was last tried."""
+        return self.progress.total_seconds - self._tried_to_save_at
 
     def _crossed(self, interval: int) -> bool:
         """Return whether the last step reached a multiple of `interval` env steps (0: never)."""
