@@ -79,6 +79,7 @@ def test_four_devices_split_scenes_and_batches_and_learn_what_one_learns(tmp_pat
     _assert_equal_runs(tmp_path / "four" / "run", expected)
 
 
+@pytest.mark.slow
 def test_two_processes_of_two_devices_learn_what_one_learns_and_one_of_them_writes(tmp_path):
     """Two pushes of every scene in one program, as accelerators do it."""
     with socket.socket() as free:
@@ -89,7 +90,8 @@ def test_two_processes_of_two_devices_learn_what_one_learns_and_one_of_them_writ
     expected = _train_on_one_device(tmp_path / "one", 2)
     said = [process.communicate(timeout=600)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0]
-    assert "training on 4 of 4 devices" in said[0] and said[1] == ""
+    assert "training on 4 of 4 devices" in said[0]
+    assert not [line for line in said[1].splitlines() if not line.startswith("[Gloo]")], "but jax's own messages"
     facts = json.loads((tmp_path / "two" / "facts.json").read_text())
     assert (facts["devices"], facts["processes"], facts["shares of scenes"]) == (4, 2, [2])
     assert facts["all copied"] and facts["gradients are added up"]

@@ -67,7 +67,11 @@ class Layout:
 
     def place(self, tree: T, shardings: Any) -> T:
         """Return a tree of local arrays, the same in every process, as `shardings`, a prefix of it, say."""
-        return tree if self.mesh is None else jax.device_put(tree, shardings)
+
+        def put(sharding: NamedSharding, part: Any) -> Any:
+            return jax.tree.map(lambda x: jax.make_array_from_callback(x.shape, sharding, x.__getitem__), part)
+
+        return tree if self.mesh is None else jax.tree.map(put, shardings, tree)
 
     def gather(self, tree: T) -> T:
         """Return a tree whole on every device, so that any process can write it; every process must call this."""
