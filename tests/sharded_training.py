@@ -7,6 +7,7 @@ folder what it saw of the devices, in facts.json.
 import conftest  # noqa: F401  (compilation cache, NPROC)
 
 # isort: split
+import dataclasses
 import json
 import os
 import sys
@@ -21,9 +22,22 @@ from pregrasp_jax.config import Config, from_dict, to_dict
 from pregrasp_jax.training import processes, session
 from pregrasp_jax.training.program import Program, TrainState
 from pregrasp_jax.training.sharding import Layout
+from pregrasp_jax.types import EnvState, StepResult
+
+TRACES: list[int] = []
+"""Grows with every trace of a push."""
 
 EPISODES = (12, 24)
 """Before and after the resume."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CountedEnv(fake_training.PictureEnv):
+    """Notes every trace of a push; a physics engine takes seconds to trace."""
+
+    def step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, StepResult]:
+        TRACES.append(1)
+        return super().step(state, action)
 
 
 def make_config(episodes: int, fused_iterations: int) -> Config:
@@ -39,7 +53,7 @@ def make_config(episodes: int, fused_iterations: int) -> Config:
 def describe(built: Program, state: TrainState) -> dict[str, Any]:
     """Return how the arrays of a training lie, and whether its parts talk to other devices."""
     learning = state.learning
-    scenes = [leaf for leaf in jax.tree.leaves(state.actors.env_states) if not isinstance(leaf, tuple)]
+    scenes = jax.tree.leaves(state.actors.env_states)
     copied = jax.tree.leaves((learning.learner, learning.replay, state.actors.tally))
     return {
         "devices": jax.device_count(),
@@ -49,6 +63,7 @@ def describe(built: Program, state: TrainState) -> dict[str, Any]:
         "devices with copies": sorted({len(leaf.sharding.device_set) for leaf in copied}),
         "all copied": all(leaf.is_fully_replicated for leaf in copied),
         "gradients are added up": "all-reduce" in (built.iterate or built.update).as_text(),  # pyright: ignore
+        "traces of a push": len(TRACES),
         "loops wait for each other": "all-reduce" in _loop(built.layout),
     }
 
@@ -81,7 +96,7 @@ def main() -> None:
             return ending
 
     fakes: dict[str, Any] = {
-        "make_env": lambda config, **options: fake_training.PictureEnv(),
+        "make_env": lambda config, **options: CountedEnv(),
         "make_program": lambda env, config, **options: fake_training.make_program(config, env, **options),
         "make_evaluate": lambda env, config: fake_training.evaluate,
         "Trainer": WatchedTrainer,
@@ -92,6 +107,7 @@ def main() -> None:
         processes.join()
     first, second = (make_config(episodes, fused_iterations) for episodes in EPISODES)
     assert session.train(first, run_dir) == 0
+    TRACES.clear()
     assert session.resume(second, run_dir) == 0
     if processes.is_first():
         run_dir.with_name("facts.json").write_text(json.dumps(facts[-1]))

@@ -74,6 +74,7 @@ def test_four_devices_split_scenes_and_batches_and_learn_what_one_learns(tmp_pat
         "devices with copies": [4],
         "all copied": True,
         "gradients are added up": True,
+        "traces of a push": 1,
         "loops wait for each other": False,
     }
     _assert_equal_runs(tmp_path / "four" / "run", expected)

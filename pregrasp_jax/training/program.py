@@ -111,6 +111,7 @@ class Program:
         Compiled ahead, a function that would need a second trace fails instead of compiling in silence.
         """
         start = time.perf_counter()
+        state = _shapes(state)
         of_state, copied = self._shardings, self.layout.copied
         if self.fused_iterations:
             due = (jax.ShapeDtypeStruct((self.fused_iterations,), dtype) for dtype in (jnp.int32, jnp.float32))
@@ -159,7 +160,7 @@ def make_program(
         # XLA's own generator compiles four times faster than threefry, forty kernels long.
         fast_key = jax.random.wrap_key_data(jnp.tile(jax.random.key_data(network_key), 2), impl="rbg")
         drawn = q.init(fast_key)
-        experience: Experience = jax.eval_shape(collect, actors, drawn)[1]
+        experience: Experience = jax.eval_shape(collect, *_shapes((actors, drawn)))[1]
         learning = init_learning(
             learner_key,
             drawn if params is None else params,
@@ -209,6 +210,11 @@ def make_iterate(program: Program) -> IterateFn:
         return jax.lax.scan(iteration, state, (jnp.asarray(updates), jnp.asarray(beta)))[0]
 
     return iterate
+
+
+def _shapes(tree: Any) -> Any:
+    """Return the shapes of a tree without where it lies: arrays that lie elsewhere would have a push traced anew."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
 
 
 def _compile(function: Callable[..., Any], arguments: tuple[Any, ...], shardings: tuple[Any, ...], result: Any) -> Any:

@@ -75,7 +75,7 @@ class Layout:
 
     def gather(self, tree: T) -> T:
         """Return a tree whole on every device, so that any process can write it; every process must call this."""
-        return tree if self.mesh is None else jax.jit(lambda x: x, out_shardings=self.copied)(tree)
+        return tree if self.mesh is None else jax.jit(_identity, out_shardings=self.copied)(tree)
 
     def one_copy(self, tree: T) -> T:
         """Return a copied tree as arrays of one device of this process."""
@@ -111,3 +111,8 @@ def refuse_uneven(config: Config, num_devices: int) -> None:
             raise ValueError(
                 f"{key} = {size} cannot be split over {num_devices} devices; allowed are multiples of {num_devices}"
             )
+
+
+def _identity(tree: T) -> T:
+    """Return what it gets; one function for all calls, so that it is compiled once."""
+    return tree
