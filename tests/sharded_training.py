@@ -72,7 +72,7 @@ def _loop(layout: Layout) -> str:
     """Return the machine code of a loop over scenes, each of another length."""
     count = layout.vmap(lambda n: jax.lax.while_loop(lambda k: k < n, lambda k: k + 1, jnp.int32(0)))
     lengths = jax.ShapeDtypeStruct((8,), jnp.int32, sharding=layout.split)
-    return jax.jit(count).lower(lengths).compile().as_text()
+    return jax.jit(count).lower(lengths).compile().as_text() or ""
 
 
 def main() -> None:

@@ -21,7 +21,7 @@ from pregrasp_jax.training import processes, sharding
 from pregrasp_jax.training.run_folder import RunFolder, WatchedFolder
 
 SCRIPT = Path(__file__).with_name("sharded_training.py")
-TOLERANCE = {"rel": 1e-3, "abs": 1e-5}
+RTOL, ATOL = 1e-3, 1e-5
 """Between sums in another order, after a hundred pushes of learning from them."""
 
 
@@ -50,12 +50,12 @@ def _assert_equal_runs(got: Path, expected: Path) -> None:
     assert len(rows[0]) == len(rows[1]) > 15 and rows[0][-1]["episodes"] >= EPISODES[-1]
     for row, wanted in zip(*rows, strict=True):
         for name, value in wanted.items():
-            assert row[name] == (value if value is None else pytest.approx(value, **TOLERANCE)), name
+            assert row[name] == (value if value is None else pytest.approx(value, rel=RTOL, abs=ATOL)), name
     arrays, wanted = (read_newest_arrays(path / "checkpoints")[0] for path in (got, expected))
     assert arrays.keys() == wanted.keys() and int(wanted["learning/learner/gradient_steps"]) > 20
     for name, value in wanted.items():
         if value.dtype == np.float32:
-            np.testing.assert_allclose(arrays[name], value, rtol=TOLERANCE["rel"], atol=TOLERANCE["abs"], err_msg=name)
+            np.testing.assert_allclose(arrays[name], value, rtol=RTOL, atol=ATOL, err_msg=name)
         else:
             np.testing.assert_array_equal(arrays[name], value, err_msg=name)
 

@@ -16,6 +16,9 @@ from jax.experimental import multihost_utils
 NUM_PROCESSES, PROCESS_ID = "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
 """Environment variables beside jax's own JAX_COORDINATOR_ADDRESS, for hosts without a cluster manager."""
 
+FAREWELL = 60
+"""s that a process which ends, or fails, waits for the others to end too; then jax ends them all."""
+
 
 def join() -> None:
     """Connect this process with the others of the run; nothing may have touched a device before.
@@ -24,7 +27,11 @@ def join() -> None:
         ValueError: nobody says which process this is, of how many, and where process 0 listens.
     """
     try:
-        jax.distributed.initialize(num_processes=_number(NUM_PROCESSES), process_id=_number(PROCESS_ID))
+        jax.distributed.initialize(
+            num_processes=_number(NUM_PROCESSES),
+            process_id=_number(PROCESS_ID),
+            shutdown_timeout_seconds=FAREWELL,
+        )
     except ValueError as error:
         raise ValueError(
             f"--distributed True found no cluster ({str(error).rstrip('.')}); allowed is to start every process by "
