@@ -25,16 +25,18 @@ RTOL, ATOL = 1e-3, 1e-5
 """Between sums in another order, after a hundred pushes of learning from them."""
 
 
-def _train(run_dir: Path, fused_iterations: int, *, devices: int, **environment: str) -> subprocess.Popen:
-    """Start sharded_training.py with so many devices of its own."""
-    environment |= {
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
-        "JAX_PLATFORMS": "cpu",
-        "NPROC": "4",
-        "PYTHONPATH": str(SCRIPT.parent.parent),
-    }
+def _environment(*, devices: int) -> dict[str, str]:
+    """Return the environment of a process with so many devices."""
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    folders = os.pathsep.join(map(str, (SCRIPT.parent.parent, SCRIPT.parent)))
+    return os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "NPROC": "4", "PYTHONPATH": folders}
+
+
+def _train(run_dir: Path, fused_iterations: int, *, devices: int, **cluster: str) -> subprocess.Popen:
+    """Start sharded_training.py in a process of its own."""
     command = [sys.executable, str(SCRIPT), str(run_dir), str(fused_iterations)]
-    return subprocess.Popen(command, env=os.environ | environment, stdout=subprocess.PIPE, text=True)
+    environment = _environment(devices=devices) | cluster
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 
 
 def _train_on_one_device(run_dir: Path, fused_iterations: int) -> Path:
@@ -78,6 +80,9 @@ def test_four_devices_split_scenes_and_batches_and_learn_what_one_learns(tmp_pat
         "loops wait for each other": False,
     }
     _assert_equal_runs(tmp_path / "four" / "run", expected)
+    goes_on = make_trainer(tmp_path / "four" / "run", make_config(EPISODES[-1], 0), resume=True)
+    with goes_on.folder:
+        assert goes_on.progress.share_done(goes_on.config) == 1.0, "one device reads what four have written"
 
 
 @pytest.mark.slow
@@ -97,6 +102,44 @@ def test_two_processes_of_two_devices_learn_what_one_learns_and_one_of_them_writ
     assert (facts["devices"], facts["processes"], facts["shares of scenes"]) == (4, 2, [2])
     assert facts["all copied"] and facts["gradients are added up"]
     _assert_equal_runs(tmp_path / "two" / "run", expected)
+
+
+PUSH = """
+import conftest
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import Mesh
+from test_mjx_training import FEW, NUM_SLOTS, make_env
+from pregrasp_jax.training.sharding import AXIS, Layout
+
+env = make_env(NUM_SLOTS, FEW)
+keys = jax.random.split(jax.random.key(0), 8)
+actions = ((44 + 2 * jnp.arange(8)) * 100 + 25 + 2 * jnp.arange(8)) * 2 + 1  # eight cells ahead of the open hand
+ends = []
+for layout in (Layout(), Layout(Mesh(np.array(jax.devices()), (AXIS,)))):
+    states = jax.jit(layout.vmap(env.reset), out_shardings=layout.split)(keys)
+    start = np.asarray(states.physics_obs.object_poses)
+    push = jax.jit(layout.vmap(env.step)).lower(states, jax.device_put(actions, layout.split)).compile()
+    ends.append(push(states, jax.device_put(actions, layout.split)))
+assert not [word for word in ("all-reduce", "all-gather", "all-to-all", "permute") if word in push.as_text()]
+(one, judged), (four, judged_too) = ends
+assert not one.physics.diverged.any() and len(four.physics.qpos.sharding.device_set) == 4
+moved = np.abs(np.asarray(one.physics_obs.object_poses)[:, :NUM_SLOTS, :2] - start[:, :NUM_SLOTS, :2]).max()
+difference = np.abs(np.asarray(one.physics.qpos) - np.asarray(four.physics.qpos))
+assert difference[:, :6].max() < 1e-3, "the arm goes where it is told"
+# XLA rounds batches of 2 and of 8 differently in the last bit, and contacts amplify it.
+assert np.median(difference.max(axis=1)) < 1e-3 and np.mean(judged.reason == judged_too.reason) > 0.7
+print("moved", moved)
+"""
+
+
+@pytest.mark.slow
+def test_four_devices_push_real_scenes_as_one_does_and_do_not_talk_meanwhile():
+    environment = _environment(devices=4)
+    done = subprocess.run(
+        [sys.executable, "-c", PUSH], cwd=SCRIPT.parent, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout.split()[-1]) > 0.01, "objects were pushed"
 
 
 @pytest.mark.parametrize(
