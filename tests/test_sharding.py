@@ -49,7 +49,7 @@ def _train_on_one_device(run_dir: Path, fused_iterations: int) -> Path:
 def _assert_equal_runs(got: Path, expected: Path) -> None:
     """Compare every row of the metrics, and every array of the last checkpoint: parameters, replay, scenes."""
     rows = [timeless(path) for path in (got, expected)]
-    assert len(rows[0]) == len(rows[1]) > 15 and rows[0][-1]["episodes"] >= EPISODES[-1]
+    assert len(rows[0]) == len(rows[1]) > 10 and rows[0][-1]["episodes"] >= EPISODES[-1]
     for row, wanted in zip(*rows, strict=True):
         for name, value in wanted.items():
             assert row[name] == (value if value is None else pytest.approx(value, rel=RTOL, abs=ATOL)), name
@@ -97,7 +97,7 @@ def test_two_processes_of_two_devices_learn_what_one_learns_and_one_of_them_writ
     said = [process.communicate(timeout=600)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0]
     assert "training on 4 of 4 devices" in said[0]
-    assert not [line for line in said[1].splitlines() if not line.startswith("[Gloo]")], "but jax's own messages"
+    assert "done: " in said[0] and not [word for word in ("training", "compil", "done") if word in said[1]]
     facts = json.loads((tmp_path / "two" / "facts.json").read_text())
     assert (facts["devices"], facts["processes"], facts["shares of scenes"]) == (4, 2, [2])
     assert facts["all copied"] and facts["gradients are added up"]
