@@ -127,7 +127,8 @@ moved = np.abs(np.asarray(one.physics_obs.object_poses)[:, :NUM_SLOTS, :2] - sta
 difference = np.abs(np.asarray(one.physics.qpos) - np.asarray(four.physics.qpos))
 assert difference[:, :6].max() < 1e-3, "the arm goes where it is told"
 # XLA rounds batches of 2 and of 8 differently in the last bit, and contacts amplify it.
-assert np.median(difference.max(axis=1)) < 1e-3 and np.mean(judged.reason == judged_too.reason) > 0.7
+assert np.median(difference.max(axis=1)) < 1e-3
+assert np.mean(np.asarray(judged.reason) == np.asarray(judged_too.reason)) > 0.7
 print("moved", moved)
 """
 
