@@ -28,7 +28,10 @@ def commands() -> dict[str, Callable[..., Command]]:
 
 def _start(preset: Config) -> Callable[..., Command]:
     def start(
-        run_dir: Path, config: Annotated[Config, tyro.conf.arg(name="")] = preset, init_from: Path | None = None
+        run_dir: Path,
+        config: Annotated[Config, tyro.conf.arg(name="")] = preset,
+        init_from: Path | None = None,
+        distributed: bool = False,
     ) -> Command:
         """Start a run.
 
@@ -36,39 +39,52 @@ def _start(preset: Config) -> Callable[..., Command]:
             run_dir: New or empty folder of the run.
             config: Settings.
             init_from: Run or policy folder whose parameters are the initial ones (fine-tuning).
+            distributed: Train with the processes of other hosts, started with the same options (docs/devices.md).
         """
         from pregrasp_jax.training.session import train
 
-        return _reported(functools.partial(train, config.validate(), run_dir, init_from=init_from), run_dir)
+        session = functools.partial(train, config.validate(), run_dir, init_from=init_from)
+        return _command(session, run_dir, distributed=distributed)
 
     return start
 
 
 def _resume(stored: Config) -> Callable[..., Command]:
     def resume(
-        run_dir: Annotated[Path, tyro.conf.Positional], config: Annotated[Config, tyro.conf.arg(name="")] = stored
+        run_dir: Annotated[Path, tyro.conf.Positional],
+        config: Annotated[Config, tyro.conf.arg(name="")] = stored,
+        distributed: bool = False,
     ) -> Command:
         """Continue a run from its newest intact checkpoint. Only train.minutes and train.episodes may change.
 
         Args:
             run_dir: Folder of the run.
             config: Settings, as stored in the run.
+            distributed: Train with the processes of other hosts, started with the same options (docs/devices.md).
         """
         from pregrasp_jax.training.session import resume
 
-        return _reported(functools.partial(resume, config.validate(), run_dir), run_dir)
+        return _command(functools.partial(resume, config.validate(), run_dir), run_dir, distributed=distributed)
 
     return resume
 
 
-def _reported(session: Command, run_dir: Path) -> Command:
-    """Return a session that leaves the report of the run behind; one that is refused leaves nothing."""
+def _command(session: Command, run_dir: Path, *, distributed: bool) -> Command:
+    """Return a session, one of several processes if `distributed`, that leaves the report of the run behind.
+
+    One that is refused leaves nothing.
+    """
 
     def run() -> int:
-        code = session()
-        from pregrasp_jax.cli.report import report_session
+        from pregrasp_jax.training import processes
 
-        report_session(run_dir)
+        if distributed:
+            processes.join()
+        code = session()
+        if processes.is_first():
+            from pregrasp_jax.cli.report import report_session
+
+            report_session(run_dir)
         return code
 
     return run

@@ -124,7 +124,7 @@ class LearnerConfig:
     huber_delta: float = 0.1
     """Where the Huber loss turns linear (Eq. 4)."""
     batch_size: int = 16
-    """Transitions per update."""
+    """Transitions per update; with `mjx` on several devices a multiple of their number."""
     updates_per_step: float = 0.25
     """Updates per env step (a push of one scene); 16 scenes at 0.25 make 4 updates per parallel step."""
     warmup: int = 500
@@ -158,7 +158,7 @@ class TrainConfig:
     """How long, how wide, how often."""
 
     num_envs: int = 16
-    """Scenes stepped in parallel."""
+    """Scenes stepped in parallel; with `mjx` on several devices a multiple of their number."""
     episodes: int = 45_000
     """Stop after this many episodes (the paper trains for 45 K) ..."""
     minutes: float = 0.0

@@ -110,10 +110,11 @@ def make_trainer(
     begin: bool = True,
     said: TextIO | None = None,
     env: Any = None,
+    folder: RunFolder | None = None,
 ) -> Trainer:
     env = env or PictureEnv()
     built = make_program(config, env)
-    folder = RunFolder.open(path, config) if resume else RunFolder.create(path, config)
+    folder = folder or (RunFolder.open(path, config) if resume else RunFolder.create(path, config))
     trainer = Trainer(config, folder, built, evaluate, make_dump(env, config), Console(said or io.StringIO()))
     if begin:
         (trainer.resume if folder.has_checkpoint else trainer.begin)()

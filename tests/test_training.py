@@ -272,9 +272,9 @@ class CountingEnv(PictureEnv):
 
     traces: list[int] = dataclasses.field(default_factory=list)
 
-    def step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, StepResult]:
+    def step(self, state: EnvState, action: jax.Array, **options: Any) -> tuple[EnvState, StepResult]:
         self.traces.append(1)
-        next_state, result = super().step(state, action)
+        next_state, result = super().step(state, action, **options)
         seen = state.physics_obs
         return next_state.replace(physics_obs=seen.replace(overflows=seen.overflows + 5)), result
 

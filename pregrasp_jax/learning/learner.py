@@ -166,6 +166,7 @@ def learn(
     importance_exponent: jax.Array | float,
     priority_exponent: float,
     augment_fn: AugmentFn | None = None,
+    split_fn: Callable[[Batch], Batch] = lambda batch: batch,
     **update_options: Any,
 ) -> tuple[LearnerState, Replay, dict[str, jax.Array]]:
     """Sample, update, set priorities.
@@ -179,12 +180,14 @@ def learn(
         importance_exponent: beta, 0.4 -> 1 over training.
         priority_exponent: alpha.
         augment_fn: changes what is learned from to something equivalent.
+        split_fn: returns the same batch, spread over several devices.
         **update_options: keyword arguments of `update`.
     """
     sample_key, augment_key = jax.random.split(key)
     batch = replay_lib.sample(
         replay, sample_key, batch_size=batch_size, importance_exponent=importance_exponent, input_fn=input_fn
     )
+    batch = split_fn(batch)
     if augment_fn is not None:
         inputs, action = augment_fn(augment_key, batch.inputs, batch.action)
         batch = batch.replace(inputs=inputs, action=action)

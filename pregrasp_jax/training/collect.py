@@ -18,6 +18,7 @@ from pregrasp_jax.judge import TARGET_IN_REGION
 from pregrasp_jax.learning.learner import ApplyFn, Params, greedy_action
 from pregrasp_jax.learning.replay import InputFn, Steps
 from pregrasp_jax.training.mishap import Mishap, no_mishap
+from pregrasp_jax.training.sharding import VmapFn
 from pregrasp_jax.types import REASONS, EnvState, HullBank, StepResult
 
 RECENT_EPISODES = 200
@@ -73,11 +74,11 @@ class Tally(struct.PyTreeNode):
     def begin_report(self) -> "Tally":
         """Return the tally with the counts since the last report at 0."""
         return self.replace(
-            pushes=jnp.int32(0),
-            reward=jnp.float32(0),
-            explored=jnp.int32(0),
-            overflowed=jnp.int32(0),
-            diverged=jnp.int32(0),
+            pushes=jnp.zeros_like(self.pushes),
+            reward=jnp.zeros_like(self.reward),
+            explored=jnp.zeros_like(self.explored),
+            overflowed=jnp.zeros_like(self.overflowed),
+            diverged=jnp.zeros_like(self.diverged),
             reasons=jnp.zeros_like(self.reasons),
         )
 
@@ -120,8 +121,8 @@ CollectFn = Callable[[Actors, Params], tuple[Actors, Experience]]
 """``(actors, params) -> (actors, experience)``."""
 
 
-def init_actors(key: jax.Array, env: Environment, num_envs: int) -> Actors:
-    """Return `num_envs` scenes at the start of an episode."""
+def init_actors(key: jax.Array, env: Environment, num_envs: int, *, vmap: VmapFn = jax.vmap) -> Actors:
+    """Return `num_envs` scenes at the start of an episode; `vmap` is as in `make_collect`."""
     key, reset_key = jax.random.split(key)
     tally = Tally(
         env_steps=jnp.int32(0),
@@ -134,12 +135,18 @@ def init_actors(key: jax.Array, env: Environment, num_envs: int) -> Actors:
         diverged=jnp.int32(0),
         reasons=jnp.zeros(len(REASONS), jnp.int32),
     )
-    states = jax.vmap(env.reset)(jax.random.split(reset_key, num_envs))
+    states = vmap(env.reset)(jax.random.split(reset_key, num_envs))
     return Actors(states, key, tally, no_mishap(states))
 
 
 def make_collect(
-    env: Environment, apply_fn: ApplyFn, input_fn: InputFn, config: ExplorationConfig, *, warmup: int
+    env: Environment,
+    apply_fn: ApplyFn,
+    input_fn: InputFn,
+    config: ExplorationConfig,
+    *,
+    warmup: int,
+    vmap: VmapFn = jax.vmap,
 ) -> CollectFn:
     """Return the function that pushes once in every scene and resets those that ended.
 
@@ -149,6 +156,7 @@ def make_collect(
         input_fn: what the network sees of an observation.
         config: exploration.
         warmup: env steps of pure exploration.
+        vmap: maps pushes and resets over scenes.
     """
 
     def explore(key: jax.Array, state: EnvState, mask: jax.Array) -> jax.Array:
@@ -187,7 +195,7 @@ def make_collect(
         # Scenes first, then the branches: [E (1 + branches)].
         starts = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * (1 + config.branches)), states)
         actions = actions.T.ravel()
-        ends, results = jax.vmap(env.step)(starts, actions)
+        ends, results = vmap(env.step)(starts, actions)
         of_branch = jnp.arange(len(actions)) >= num_envs
         results = results.replace(truncated=results.truncated | (of_branch & ~results.terminated))
         root = jnp.arange(len(actions), dtype=jnp.int32) % num_envs
@@ -199,7 +207,7 @@ def make_collect(
         diverged = steps.outcome.diverged
         tally = _count(actors.tally, results, ended, random[:, 0], overflowed, diverged)
         mishap = actors.mishap.note(states, actions, ends, diverged, tally.env_steps)
-        fresh = jax.vmap(env.reset)(jax.random.split(reset_key, num_envs))
+        fresh = vmap(env.reset)(jax.random.split(reset_key, num_envs))
         actors = Actors(_select(ended, fresh, next_states), key, tally, mishap)
         return actors, experience.replace(episodes=tally.episodes)
 

@@ -16,7 +16,7 @@ from pregrasp_jax.config import LearnerConfig, ReplayConfig, TaskConfig
 from pregrasp_jax.learning import hindsight, learner
 from pregrasp_jax.learning import replay as replay_lib
 from pregrasp_jax.learning.learner import ApplyFn, AugmentFn, LearnerState, MaskFn, Params, QAtFn
-from pregrasp_jax.learning.replay import InputFn, Replay, Steps
+from pregrasp_jax.learning.replay import Batch, InputFn, Replay, Steps
 from pregrasp_jax.training.collect import Experience
 
 
@@ -39,7 +39,7 @@ class Learning(struct.PyTreeNode):
 
     def begin_report(self) -> "Learning":
         """Return the state with updates and metrics counted anew."""
-        return self.replace(updates=jnp.int32(0), metrics=jax.tree.map(jnp.zeros_like, self.metrics))
+        return self.replace(updates=jnp.zeros_like(self.updates), metrics=jax.tree.map(jnp.zeros_like, self.metrics))
 
 
 RememberFn = Callable[[Learning, Experience], Learning]
@@ -105,6 +105,7 @@ def make_update(
     optimizer: optax.GradientTransformation,
     config: LearnerConfig,
     replay_config: ReplayConfig,
+    split_fn: Callable[[Batch], Batch],
 ) -> UpdateFn:
     """Return the function that updates once.
 
@@ -117,6 +118,7 @@ def make_update(
         optimizer: see `make_optimizer`.
         config: discount, loss, batch.
         replay_config: prioritization.
+        split_fn: see `learner.learn`.
     """
 
     def update(state: Learning, beta: jax.Array) -> Learning:
@@ -128,6 +130,7 @@ def make_update(
             batch_size=config.batch_size,
             input_fn=input_fn,
             augment_fn=augment_fn,
+            split_fn=split_fn,
             importance_exponent=beta,
             priority_exponent=replay_config.priority_exponent,
             apply_fn=apply_fn,

@@ -4,7 +4,7 @@ import dataclasses
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import flax.struct as struct
@@ -27,6 +27,7 @@ from pregrasp_jax.training.learn import (
     make_remember,
     make_update,
 )
+from pregrasp_jax.training.sharding import Layout
 
 CACHE_SWITCH = "PREGRASP_JAX_COMPILATION_CACHE"
 """Environment variable: 0 turns the compilation cache off."""
@@ -75,6 +76,7 @@ class Program:
         update: samples and updates once; donates the learning state.
         fused_iterations: how many iterations `compile` puts into one program, see `make_iterate`; 0 compiles the parts.
         iterate: that program.
+        layout: which device holds what of all this.
     """
 
     init: Callable[[jax.Array], TrainState]
@@ -83,10 +85,25 @@ class Program:
     update: UpdateFn
     fused_iterations: int = 0
     iterate: IterateFn | None = None
+    layout: Layout = field(default_factory=Layout)
 
     def shapes(self) -> TrainState:
         """Return the shapes of the state without making one."""
         return jax.eval_shape(self.init, jax.random.key(0))
+
+    def begin(self, key: jax.Array) -> TrainState:
+        """Return the state that a key begins with."""
+        return jax.jit(self.init, out_shardings=self._shardings)(key)
+
+    def place(self, state: TrainState) -> TrainState:
+        """Return a state that was read from a checkpoint, every part where it belongs."""
+        return self.layout.place(state, self._shardings)
+
+    @property
+    def _shardings(self) -> Any:
+        """How a state lies, as a prefix of it: scenes are split over the devices, all else is copied."""
+        split, copied = self.layout.split, self.layout.copied
+        return TrainState(Actors(split, copied, copied, copied), copied)  # pyright: ignore[reportArgumentType]
 
     def compile(self, state: TrainState) -> tuple["Program", float]:
         """Return the program compiled for a state, and the seconds that it took.
@@ -94,16 +111,20 @@ class Program:
         Compiled ahead, a function that would need a second trace fails instead of compiling in silence.
         """
         start = time.perf_counter()
+        state = _shapes(state)
+        of_state, copied = self._shardings, self.layout.copied
         if self.fused_iterations:
             due = (jax.ShapeDtypeStruct((self.fused_iterations,), dtype) for dtype in (jnp.int32, jnp.float32))
-            iterate = jax.jit(make_iterate(self), donate_argnums=0).lower(state, *due).compile()
+            iterate = _compile(make_iterate(self), (state, *due), (of_state, copied, copied), of_state)
             return dataclasses.replace(self, iterate=iterate), time.perf_counter() - start
-        params = state.learning.learner.params
-        collect = jax.jit(self.collect, donate_argnums=0).lower(state.actors, params).compile()
-        experience = jax.eval_shape(self.collect, state.actors, params)[1]
-        remember = jax.jit(self.remember, donate_argnums=0).lower(state.learning, experience).compile()
-        update = jax.jit(self.update, donate_argnums=0).lower(state.learning, np.float32(0)).compile()
-        return Program(self.init, collect, remember, update), time.perf_counter() - start
+        arguments = (state.actors, state.learning.learner.params)
+        experience = jax.eval_shape(self.collect, *arguments)[1]
+        parts = {
+            "collect": _compile(self.collect, arguments, (of_state.actors, copied), (of_state.actors, copied)),
+            "remember": _compile(self.remember, (state.learning, experience), (copied, copied), copied),
+            "update": _compile(self.update, (state.learning, np.float32(0)), (copied, copied), copied),
+        }
+        return dataclasses.replace(self, **parts), time.perf_counter() - start
 
 
 def make_program(
@@ -112,6 +133,7 @@ def make_program(
     *,
     params: Params | None = None,
     q_function: QFunction | None = None,
+    layout: Layout = Layout(),  # noqa: B008  (frozen)
 ) -> Program:
     """Return the program of a configuration, not compiled.
 
@@ -120,6 +142,7 @@ def make_program(
         config: the run.
         params: initial parameters; drawn from the seed if None.
         q_function: the one of the configuration if None.
+        layout: where it will run; one device unless told otherwise.
 
     Raises:
         ValueError: `params` do not fit the network.
@@ -127,15 +150,17 @@ def make_program(
     q = q_function or make_q_function(config.network, config.task)
     optimizer = make_optimizer(config.learner)
     # Under jit, so that shapes, start and compilation share one trace: that of a physics engine takes seconds.
-    collect = jax.jit(make_collect(env, q.apply, q.input_fn, config.exploration, warmup=config.learner.warmup))
+    collect = jax.jit(
+        make_collect(env, q.apply, q.input_fn, config.exploration, warmup=config.learner.warmup, vmap=layout.vmap)
+    )
 
     def init(key: jax.Array) -> TrainState:
         network_key, actor_key, learner_key = jax.random.split(key, 3)
-        actors = init_actors(actor_key, env, config.train.num_envs)
+        actors = init_actors(actor_key, env, config.train.num_envs, vmap=layout.vmap)
         # XLA's own generator compiles four times faster than threefry, forty kernels long.
         fast_key = jax.random.wrap_key_data(jnp.tile(jax.random.key_data(network_key), 2), impl="rbg")
         drawn = q.init(fast_key)
-        experience: Experience = jax.eval_shape(collect, actors, drawn)[1]
+        experience: Experience = jax.eval_shape(collect, *_shapes((actors, drawn)))[1]
         learning = init_learning(
             learner_key,
             drawn if params is None else params,
@@ -155,6 +180,7 @@ def make_program(
         optimizer=optimizer,
         config=config.learner,
         replay_config=config.replay,
+        split_fn=layout.split_batch,
     )
     if params is not None and not q.fits(params):
         raise ValueError(
@@ -162,7 +188,7 @@ def make_program(
             f"{config.network.architecture} and network.width = {config.network.width}"
         )
     remember = make_remember(config.replay, config.task)
-    return Program(init, collect, remember, update, config.train.fused_iterations)
+    return Program(init, collect, remember, update, config.train.fused_iterations, layout=layout)
 
 
 def make_iterate(program: Program) -> IterateFn:
@@ -184,6 +210,17 @@ def make_iterate(program: Program) -> IterateFn:
         return jax.lax.scan(iteration, state, (jnp.asarray(updates), jnp.asarray(beta)))[0]
 
     return iterate
+
+
+def _shapes(tree: Any) -> Any:
+    """Return the shapes of a tree without where it lies: arrays that lie elsewhere would have a push traced anew."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
+
+
+def _compile(function: Callable[..., Any], arguments: tuple[Any, ...], shardings: tuple[Any, ...], result: Any) -> Any:
+    """Return a function compiled for its arguments and for where they and the result lie; it donates the first."""
+    jitted = jax.jit(function, donate_argnums=0, in_shardings=shardings, out_shardings=result)
+    return jitted.lower(*arguments).compile()
 
 
 def enable_compilation_cache() -> None:

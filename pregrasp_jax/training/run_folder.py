@@ -27,9 +27,16 @@ EXTENDABLE = ("train.minutes", "train.episodes", "train.tensorboard")
 
 
 class RunFolder:
-    """A locked run folder; `create` or `open` one, and use it in a `with` block."""
+    """A locked run folder; `create` or `open` one, and use it in a `with` block.
 
-    def __init__(self, path: Path, lock: TextIO):
+    Attributes:
+        path: of the folder.
+        writes: whether this process writes to it.
+    """
+
+    writes = True
+
+    def __init__(self, path: Path, lock: TextIO | None):
         """Hold the lock; use `create` or `open`."""
         self.path = path
         self._lock = lock
@@ -96,7 +103,8 @@ class RunFolder:
 
     def __exit__(self, *_: object) -> None:
         """Release the lock."""
-        self._lock.close()
+        if self._lock:
+            self._lock.close()
 
     def begin_session(self, hashes: dict[str, str]) -> None:
         """Record versions, machine and hashes; call it before anything else is written.
@@ -144,6 +152,28 @@ class RunFolder:
         if file.exists():
             kept = [line for line in file.read_text(errors="replace").splitlines() if _env_steps(line) <= env_steps]
             io.write_bytes(file, "".join(f"{line}\n" for line in kept).encode())
+
+
+class WatchedFolder(RunFolder):
+    """A run folder as the processes see it that do not write: they only read its checkpoints."""
+
+    writes = False
+
+    def __init__(self, path: Path):
+        """Lock nothing."""
+        super().__init__(path, None)
+
+    def begin_session(self, hashes: dict[str, str]) -> None:
+        """Record nothing."""
+
+    def begin_event_log(self, *, resumed_at: int | None = None) -> None:
+        """Write no events."""
+
+    def append_metrics(self, row: dict[str, Any]) -> None:
+        """Append nothing."""
+
+    def forget_metrics_after(self, env_steps: int) -> None:
+        """Drop nothing."""
 
 
 def refuse_used(path: Path) -> None:

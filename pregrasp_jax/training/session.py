@@ -1,22 +1,26 @@
 """A training session: objects, scenes, program and run folder put together, then the loop of `trainer`."""
 
+import os
 from pathlib import Path
 from typing import Any
 
-from pregrasp_jax import policies
+import jax
+
+from pregrasp_jax import io, policies
 from pregrasp_jax.checkpoint.policy import load_policy
-from pregrasp_jax.config import Config
+from pregrasp_jax.config import Config, to_dict
 from pregrasp_jax.env import Env, make_env
 from pregrasp_jax.evaluation import Evaluator
 from pregrasp_jax.learning.learner import Params
 from pregrasp_jax.learning.q_function import make_q_function
-from pregrasp_jax.training import resources
+from pregrasp_jax.training import processes, resources
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.dump import make_dump
 from pregrasp_jax.training.event_log import require_module
 from pregrasp_jax.training.interrupt import Interrupt
 from pregrasp_jax.training.program import enable_compilation_cache, make_program
-from pregrasp_jax.training.run_folder import RunFolder, refuse_used
+from pregrasp_jax.training.run_folder import RunFolder, WatchedFolder, refuse_used
+from pregrasp_jax.training.sharding import make_layout
 from pregrasp_jax.training.trainer import EvaluateFn, Trainer
 
 VALIDATION_ENVS = 16
@@ -40,9 +44,10 @@ def train(config: Config, run_dir: Path, *, init_from: Path | None = None, conso
     Raises:
         ValueError: one line says what cannot be used, and what is allowed.
     """
-    refuse_used(run_dir)
+    if processes.is_first():
+        refuse_used(run_dir)
     params = None if init_from is None else load_policy(init_from).params
-    return _session(config, run_dir, None, params, console or Console())
+    return _session(config, run_dir, None, params, console or _console())
 
 
 def resume(config: Config, run_dir: Path, *, console: Console | None = None) -> int:
@@ -53,8 +58,8 @@ def resume(config: Config, run_dir: Path, *, console: Console | None = None) -> 
         run_dir: folder of the run.
         console: told about progress.
     """
-    folder = RunFolder.open(run_dir, config)
-    return _session(config, run_dir, folder, None, console or Console())
+    folder = RunFolder.open(run_dir, config) if processes.is_first() else WatchedFolder(run_dir)
+    return _session(config, run_dir, folder, None, console or _console())
 
 
 def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
@@ -62,15 +67,20 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
     config.validate()
     if config.train.tensorboard:
         require_module()
+    layout = make_layout(config)
+    if jax.device_count() > 1:
+        console.say(f"training on {layout.num_devices} of {jax.device_count()} devices")
     env = _load(config, "train", console)
     validation = _load(config, "validation", console)
-    program = make_program(env, config, params=params)
+    program = make_program(env, config, params=params, layout=layout)
     resources.check(*program.shapes().split(), run_dir)
-    resumed, folder = folder is not None, folder or RunFolder.create(run_dir, config)
+    hashes = _hashes(env, validation)
+    processes.refuse_difference(io.content_hash(to_dict(config), hashes))
+    resumed, folder = folder is not None, folder or _create(run_dir, config)
     trainer = Trainer(config, folder, program, make_evaluate(validation, config), make_dump(env, config), console)
     with folder, Interrupt(console.say, console.close) as interrupt:
-        folder.begin_session(_hashes(env, validation))
-        (trainer.resume if resumed and folder.has_checkpoint else trainer.begin)()
+        folder.begin_session(hashes)
+        (trainer.resume if processes.agreed(resumed and folder.has_checkpoint) else trainer.begin)()
         try:
             ending = trainer.run(lambda: interrupt.exit_code is not None)
         finally:
@@ -89,6 +99,15 @@ def make_evaluate(env: Env, config: Config) -> EvaluateFn:
         return evaluator.run(make_policy(params), episodes=episodes, seed=config.seed).summary()
 
     return evaluate
+
+
+def _console() -> Console:
+    """Return a console that is heard in process 0 only."""
+    return Console(None if processes.is_first() else Path(os.devnull).open("w"))
+
+
+def _create(run_dir: Path, config: Config) -> RunFolder:
+    return RunFolder.create(run_dir, config) if processes.is_first() else WatchedFolder(run_dir)
 
 
 def _load(config: Config, split: Any, console: Console) -> Env:

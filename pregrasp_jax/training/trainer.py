@@ -14,7 +14,7 @@ from pregrasp_jax import exploration
 from pregrasp_jax.checkpoint import restore, save, save_policy
 from pregrasp_jax.config import Config
 from pregrasp_jax.learning.learner import Params
-from pregrasp_jax.training import collect, learn
+from pregrasp_jax.training import collect, learn, processes
 from pregrasp_jax.training.console import Console, announced_compilation, format_time
 from pregrasp_jax.training.dump import DumpFn
 from pregrasp_jax.training.mishap import NONE
@@ -105,7 +105,7 @@ class Trainer:
         Raises:
             ValueError: it cannot be written, so no later one could.
         """
-        self.state = jax.jit(self.program.init)(jax.random.key(self.config.seed))
+        self.state = self.program.begin(jax.random.key(self.config.seed))
         if self.config.train.tensorboard:
             self.folder.begin_event_log()
         self.save()
@@ -119,10 +119,11 @@ class Trainer:
             ValueError: there is none, or it does not fit the configuration.
         """
         template, ring = self.program.shapes().split()
-        restored = restore(self.folder.checkpoints, template, ring)
+        with processes.first_goes_first("restore"):  # it sets damaged checkpoints aside
+            restored = restore(self.folder.checkpoints, template, ring)
         for problem in restored.problems:
             self.console.say(f"warning: {problem}; going on from the checkpoint of step {restored.step}")
-        self.state = restored.tree.join(restored.ring)
+        self.state = self.program.place(restored.tree.join(restored.ring))
         self.progress = Progress(**restored.extra)
         self.folder.forget_metrics_after(restored.step)
         if self.config.train.tensorboard:
@@ -143,15 +144,15 @@ class Trainer:
         with announced_compilation(self.console.say):
             program, _ = self.program.compile(self.state)
         self.console.start()
-        while progress.share_done(self.config) < 1.0:
-            if stop():
+        while processes.agreed(progress.share_done(self.config) < 1.0):
+            if processes.agreed(stop()):
                 return self._interrupted()
             self._step(program)
             if self._crossed(self.config.train.log_every):
                 self.log()
             if self._crossed(self.config.train.evaluate_every):
                 self.evaluate()
-            if progress.total_seconds - self._tried_to_save_at >= 60 * self.config.train.checkpoint_minutes:
+            if processes.agreed(self._seconds_unsaved >= 60 * self.config.train.checkpoint_minutes):
                 self.save()
         self.dump()
         self.evaluate()
@@ -256,7 +257,8 @@ class Trainer:
         if progress.evaluated_at == progress.env_steps:
             return
         progress.evaluated_at = progress.env_steps
-        params = self.state.learning.learner.target_params  # the average is the better policy: it jumps less
+        # The average is the better policy: it jumps less. One device evaluates, in every process the same.
+        params = self.program.layout.one_copy(self.state.learning.learner.target_params)
         with progress.timed("evaluate"):
             measured = self.evaluate_fn(params)
         self._unsaved = True  # the best score is part of a checkpoint
@@ -276,7 +278,7 @@ class Trainer:
         if self.saved:
             return
         self._refuse_non_finite()
-        rest, _ = self.state.split()
+        rest = self.program.layout.gather(self.state.split()[0])
         ring, extra = self.state.ring(), dict(vars(progress))
         with progress.timed("checkpoint"):
             written = self._write(
@@ -284,7 +286,7 @@ class Trainer:
                 lambda: save(self.folder.checkpoints, progress.env_steps, rest, ring, extra),
             )
         self._tried_to_save_at = progress.total_seconds
-        if written:
+        if processes.agreed(written):
             self._saved_at, self._unsaved = progress.env_steps, False
 
     @property
@@ -294,6 +296,8 @@ class Trainer:
 
     def _write(self, what: str, write: Callable[[], object]) -> bool:
         """Write a file; a full disk is reported, and the training goes on. Return whether it was written."""
+        if not self.folder.writes:
+            return True
         try:
             write()
         except OSError as error:
@@ -304,6 +308,11 @@ class Trainer:
             )
             return False
         return True
+
+    @property
+    def _seconds_unsaved(self) -> float:
+        """Training time since a checkpoint was last tried."""
+        return self.progress.total_seconds - self._tried_to_save_at
 
     def _crossed(self, interval: int) -> bool:
         """Return whether the last step reached a multiple of `interval` env steps (0: never)."""

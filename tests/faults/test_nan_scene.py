@@ -30,8 +30,8 @@ NAN = REASONS.index("nan")
 class FrailEnv(PictureEnv):
     """Reports what an engine reports: whether anything of a scene is not finite."""
 
-    def step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, StepResult]:
-        next_state, result = super().step(state, action)
+    def step(self, state: EnvState, action: jax.Array, **options: Any) -> tuple[EnvState, StepResult]:
+        next_state, result = super().step(state, action, **options)
         diverged = ~jnp.all(jnp.isfinite(state.centroids))
         outcome = result.outcome.replace(diverged=diverged)
         reward, terminated, reason = judge(outcome, state.scene.target)
