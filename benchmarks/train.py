@@ -14,6 +14,7 @@ import json
 import os
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,14 +34,27 @@ STEPS = 40
 """Parallel steps that fill the memory before anything is timed."""
 
 
+class Chain:
+    """A function (state, ...) -> state that is called on its own results, in place."""
+
+    def __init__(self, function: Callable[..., Any], state: Any):
+        self.state = state
+        self._function = jax.jit(function, donate_argnums=0)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Take one step, and return the new state."""
+        self.state = self._function(self.state, *arguments)
+        return self.state
+
+
 def fill(program: Program, state: TrainState) -> tuple[TrainState, Any]:
     """Collect `STEPS` times; return the state and the last experience."""
-    collect, remember = jax.jit(program.collect), jax.jit(program.remember)
-    experience = None
+    collect, learning = jax.jit(program.collect), Chain(program.remember, state.learning)
+    actors, experience = state.actors, None
     for _ in range(STEPS):
-        actors, experience = collect(state.actors, state.learning.learner.params)
-        state = TrainState(actors, remember(state.learning, experience))
-    return state, experience
+        actors, experience = collect(actors, learning.state.learner.params)
+        learning(experience)
+    return TrainState(actors, learning.state), experience
 
 
 def measure(config: Config) -> dict[str, Any]:
@@ -64,25 +78,27 @@ def measure(config: Config) -> dict[str, Any]:
     def target(params: Any, batch: replay.Batch) -> jax.Array:
         return jax.vmap(learner.max_q)(q.apply(params, batch.next_inputs), jax.vmap(env.action_mask)(batch.next_p1))
 
-    reset, collect, remember, update = (
-        jax.jit(f) for f in (jax.vmap(env.reset), program.collect, program.remember, program.update)
+    reset, collect, act, sample, target = (
+        jax.jit(f) for f in (jax.vmap(env.reset), program.collect, act, sample, target)
     )
-    act, sample, target = jax.jit(act), jax.jit(sample), jax.jit(target)
     batch = sample(memory, key)
     keys = jax.random.split(key, num_envs)
     ms = {
         "collect": best_ms(lambda: collect(state.actors, params)),
         "act": best_ms(lambda: act(params, states)),
         "reset": best_ms(lambda: reset(keys)),
-        "remember": best_ms(lambda: remember(learning, experience)),
         "sample": best_ms(lambda: sample(memory, key)),
         "target": best_ms(lambda: target(params, batch)),
-        "update": best_ms(lambda: update(learning, jnp.float32(0.4))),
     }
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         save(Path(folder), 1, state.split()[0], state.ring(), {})
     ms["checkpoint"] = 1e3 * (time.perf_counter() - start)
+    # Last, because they take the memory and give it back changed, as in training: a copy would cost more than the work.
+    remember = Chain(program.remember, learning)
+    ms["remember"] = best_ms(lambda: remember(experience))
+    update = Chain(program.update, remember.state)
+    ms["update"] = best_ms(lambda: update(jnp.float32(0.4)))
     return summary(ms, config)
 
 
