@@ -100,25 +100,13 @@ def measure(num_scenes: int, num_steps: int) -> dict[str, Any]:
 def compile_stages(env: Env) -> dict[str, Callable[..., Any]]:
     """Return the stages of a step, each vmapped and compiled alone."""
 
-    def plan(state: EnvState, action: jax.Array) -> primitives.Plan:
-        row, col, aperture = grid.decode_action(action)
-        return primitives.plan_push(
-            state.physics_obs.joint_pos[:6],
-            state.p1,
-            grid.cell_to_world(row, col),
-            state.aperture,
-            aperture,
-            push_speed=env.task.push_speed,
-            num_rows=primitives.num_push_rows(env.max_distance, env.task.push_speed),
-        )
-
     def physics(state: EnvState, plan: primitives.Plan) -> Any:
         return env.engine.run(state.physics, plan.ctrl, jnp.where(plan.reachable, plan.num_ctrl, 0))
 
     def look(state: EnvState) -> Any:
         return heightmap.observe(heightmap.scene_hulls(env.bank, state.scene, state.physics_obs), state.p1)
 
-    stages = {"action": sample_action, "plan": plan, "physics": physics, "heightmap": look}
+    stages = {"action": sample_action, "plan": env.plan, "physics": physics, "heightmap": look}
     return {name: jax.jit(jax.vmap(function)) for name, function in stages.items()}
 
 

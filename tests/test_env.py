@@ -35,13 +35,17 @@ TOO_LONG = (50, 60, CLOSED)
 
 @dataclass(frozen=True)
 class Case:
-    """A target and an obstacle, each an object and a pose, a push, and how it must end (None: a reward left open)."""
+    """A target and an obstacle, each an object and a pose, a push, and how it must end (None: a reward left open).
+
+    Without `execute` neither the push nor the grasp is made.
+    """
 
     target: tuple[str, list[float]]
     obstacle: tuple[str, list[float]]
     action: tuple[int, int, int] = SHORT
     reason: str = "running"
     reward: float | None = 0.0
+    execute: bool = True
 
 
 def pose(x: float, y: float, z: float = 0.0, *, tilt: float = 0.0, about: float = 0.0) -> list[float]:
@@ -84,6 +88,7 @@ CASES = {
     "away": Case(("ycb_mustard_bottle", closer_by(-0.01)), BLOCK, SIDEWAYS),
     "too long": Case(BOTTLE, BLOCK, TOO_LONG, "unreachable"),
     "too long, and below the table": Case(("ycb_mustard_bottle", pose(0.1, 0, -0.16)), BLOCK, TOO_LONG, "unreachable"),
+    "not executed": Case(CAN_AT_PALM, BLOCK, reason="unreachable", execute=False),
     "target beyond the edge": Case(("ycb_mustard_bottle", pose(0.1, -0.26)), BLOCK, reason="off_table"),
     "obstacle beyond the edge": Case(BOTTLE, ("ycb_wood_block", pose(0.26, 0.1)), reason="off_table"),
     "both just inside": Case(("ycb_mustard_bottle", pose(0.1, -0.24)), ("ycb_wood_block", pose(0.24, 0.1)), reward=0.5),
@@ -139,16 +144,21 @@ class Pushes:
     traces: list[str]
 
 
+def executed(cases: dict[str, Case]) -> jax.Array:
+    return jnp.array([case.execute for case in cases.values()])
+
+
 def push_all(env: Env, cases: dict[str, Case]) -> Pushes:
     traces = []
 
-    def step(state, action):
+    def step(state, action, execute):
         traces.append("step")
-        return env.step(state, action)
+        return env.step(state, action, execute=execute)
 
     jitted = jax.jit(jax.vmap(step))
     before = jax.jit(jax.vmap(env.start))(stack([make_scene(case) for case in cases.values()]))
-    after, result = jitted(before, jnp.array([encode(*case.action) for case in cases.values()]))
+    actions = jnp.array([encode(*case.action) for case in cases.values()])
+    after, result = jitted(before, actions, executed(cases))
     return Pushes(
         after, unstack(before, cases), unstack(after, cases), unstack(result, cases), step=jitted, traces=traces
     )
@@ -190,7 +200,9 @@ def test_what_is_measured_agrees_with_mujoco_and_numpy(env, pushes, name):
         assert outcome.toppled[slot] == (np.arccos(min(up[8], 1.0)) > 0.7)
         np.testing.assert_allclose(outcome.distance_before[slot], np.linalg.norm(start - START), atol=1e-5)
         row, col, _ = CASES[name].action
-        end = START if "too long" in name else np.array([-0.25 + 0.005 * (col + 0.5), -0.25 + 0.005 * (row + 0.5)])
+        end = np.array([-0.25 + 0.005 * (col + 0.5), -0.25 + 0.005 * (row + 0.5)])
+        if outcome.unreachable:
+            end = START
         np.testing.assert_allclose(outcome.distance_after[slot], np.linalg.norm(np.subtract(end_xy, end)), atol=3e-4)
     empty = np.delete(np.arange(MAX_OBJECTS), [TARGET, OBSTACLE])
     assert not outcome.toppled[empty].any() and not outcome.off_table[empty].any() and not outcome.coverage[empty].any()
@@ -213,11 +225,12 @@ def test_only_an_open_hand_has_a_closing_region(pushes):
     assert not pushes.result["target at the palm of a closing hand"].outcome.coverage.any()
 
 
-def test_an_unreachable_push_changes_nothing(pushes):
-    before, after = pushes.before["too long"], pushes.after["too long"]
+@pytest.mark.parametrize("name", ["too long", "not executed"])
+def test_a_push_that_is_not_made_changes_nothing(pushes, name):
+    before, after = pushes.before[name], pushes.after[name]
     jax.tree.map(np.testing.assert_array_equal, before, after)
-    outcome = pushes.result["too long"].outcome
-    assert outcome.unreachable and not outcome.off_table.any()
+    outcome = pushes.result[name].outcome
+    assert outcome.unreachable
     np.testing.assert_array_equal(outcome.distance_before, outcome.distance_after)
     assert pushes.result["too long, and below the table"].outcome.off_table.any()
 
@@ -233,14 +246,14 @@ def test_a_diverged_scene_harms_no_other(pushes):
 def test_pushes_follow_one_another_in_one_trace(pushes):
     """The second push starts where the first one ended; whatever the actions, the step is traced once."""
     actions = jnp.array([encode(50, 10, OPEN)] * len(CASES))
-    state, result = pushes.step(pushes.batch, actions)
+    state, result = pushes.step(pushes.batch, actions, jnp.ones(len(CASES), bool))
     again, result = unstack(state, CASES), unstack(result, CASES)
     for name in ("towards the target", "with a closed hand"):
         np.testing.assert_allclose(again[name].physics_obs.hand_pose[:2], [-0.1975, 0.0025], atol=5e-4)
         np.testing.assert_allclose(again[name].physics_obs.joint_pos[6:], robot.FINGER_OPEN, atol=0.01)
         assert again[name].num_pushes == 2 and again[name].aperture == OPEN
         np.testing.assert_array_equal(result[name].outcome.distance_before, pushes.result[name].outcome.distance_after)
-    assert again["too long"].num_pushes == 1, "the first was not executed"
+    assert again["too long"].num_pushes == again["not executed"].num_pushes == 1, "the first was not executed"
     assert REASONS[result["nan"].reason] == "nan"
     assert pushes.traces == ["step"]
 
@@ -254,9 +267,10 @@ def test_grasp_holds_the_target_between_the_fingers_and_nothing_else(env, pushes
     physics = env.engine.place(thrown.scene.object_ids, qpos, upwards)
     states[list(CASES).index("too long, and below the table")] = thrown.replace(physics=physics)
     before = stack(states)
-    held = unstack(jax.jit(jax.vmap(env.grasp))(before), CASES)
+    grasp = jax.vmap(lambda state, execute: env.grasp(state, execute=execute))
+    held = unstack(jax.jit(grasp)(before, executed(CASES)), CASES)
     del held["target between the fingers after the push"]  # at the tips, where a round can is held by luck
-    expected = {name: CASES[name].target == CAN_AT_PALM for name in held}
+    expected = {name: CASES[name].target == CAN_AT_PALM and CASES[name].execute for name in held}
     assert held == expected and sum(expected.values()) == 2
 
 
