@@ -38,7 +38,7 @@ def _start(preset: Config) -> Callable[..., Command]:
         Args:
             run_dir: New or empty folder of the run.
             config: Settings.
-            init_from: Run or policy folder whose parameters are the initial ones (fine-tuning).
+            init_from: Run or policy folder, or `pretrained`, whose parameters are the initial ones (fine-tuning).
             distributed: Train with the processes of other hosts, started with the same options (docs/devices.md).
         """
         from pregrasp_jax.training.session import train

@@ -97,13 +97,17 @@ POLICIES = [
     ("evaluate --policy strait", "policy strait does not exist; allowed: random, guided, straight, clear, lookahead"),
     (
         "evaluate --policy {w}/full",
-        "policy {w}/full is neither a run folder nor a policy folder; allowed: a run folder",
+        "policy {w}/full is neither a run folder nor a policy folder; allowed: pretrained, a run folder",
     ),
-    ("evaluate --policy {w}/noise", "{w}/noise is damaged or not safetensors", "; allowed: a run folder of train.py"),
+    (
+        "evaluate --policy {w}/noise",
+        "{w}/noise is damaged or not safetensors",
+        "; allowed: pretrained, a run folder of train.py",
+    ),
     (
         "evaluate --policy {w}/foreign.safetensors",
         "foreign.safetensors was not written by this package",
-        "allowed: a run",
+        "allowed: pretrained, a run",
     ),
     (
         "evaluate --policy {w}/newer.safetensors",
@@ -111,11 +115,21 @@ POLICIES = [
         "colour",
         "allowed",
     ),
-    ("evaluate --policy {w}/altered", "{w}/altered/params.safetensors is altered (checksum differs); allowed: a run"),
-    ("train ci --run-dir {w}/new --init-from {w}/nothing", "policy {w}/nothing does not exist; allowed: a run folder"),
+    (
+        "evaluate --policy {w}/altered",
+        "{w}/altered/params.safetensors is altered (checksum differs); allowed: pretrained, a run",
+    ),
+    (
+        "train ci --run-dir {w}/new --init-from {w}/nothing",
+        "policy {w}/nothing does not exist; allowed: pretrained, a run folder",
+    ),
     (
         "train ci --run-dir {w}/new --network.width 1 --init-from {w}/small",
         "(--init-from) are of another network; allowed is network.arch",
+    ),
+    (
+        "train ci --run-dir {w}/new --network.width 1 --init-from pretrained",
+        "(--init-from) are of another network; allowed is network.architecture = paper and network.width = 1",
     ),
     ("pregrasp_jax show --policy strait", "policy strait does not exist; allowed: random, guided, straight"),
     ("pregrasp_jax compare {w}/a.json {w}/c.json", "{w}/c.json: No such file or directory; wanted a file written by"),

@@ -8,7 +8,7 @@ import numpy as np
 
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.checkpoint import load_policy
-from pregrasp_jax.cli.player import PRETRAINED
+from pregrasp_jax.checkpoint.policy import PRETRAINED
 from pregrasp_jax.config import to_dict
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.types import Observation
@@ -16,7 +16,7 @@ from pregrasp_jax.types import Observation
 
 def test_it_is_small_and_fits_its_network():
     assert sum(file.stat().st_size for file in PRETRAINED.iterdir()) <= 3_000_000
-    policy = load_policy(PRETRAINED)
+    policy = load_policy("pretrained")
     q = make_q_function(policy.config.network, policy.config.task)
     assert q.fits(policy.params)
     blank = jnp.zeros((100, 100), jnp.uint8)
@@ -30,5 +30,5 @@ def test_its_evaluation_is_of_these_objects():
     assert document["episodes"] == 200 and document["object_set"] == "seen"
     assert document["success_rate"] == np.mean([row["success"] for row in document["rows"]])
     assert document["policy"] == "pretrained" and len(document["rows"]) == 200
-    trained = to_dict(load_policy(PRETRAINED).config)
+    trained = to_dict(load_policy("pretrained").config)
     assert document["config"]["network"] == trained["network"] and document["config"]["task"] == trained["task"]

@@ -24,8 +24,11 @@ FORMAT = 1
 PARAMS_PREFIX = "learning/learner/target_params/"
 """Where a training state keeps what a policy needs."""
 
+PRETRAINED = Path(__file__).parent.parent / "pretrained"
+"""The policy that ships with the package."""
+
 _PARAMS = "params.safetensors"
-_ALLOWED = f"a run folder of train.py, or a folder with the {_PARAMS} that it wrote"
+_ALLOWED = f"pretrained, a run folder of train.py, or a folder with the {_PARAMS} that it wrote"
 
 
 @dataclass(frozen=True)
@@ -62,10 +65,12 @@ def save_policy(folder: Path, params: Any, config: Config, evaluation: dict[str,
 def load_policy(path: Path | str) -> Policy:
     """Read a policy from a run folder (its best policy, else its latest checkpoint), a policy folder, or a file.
 
+    The name `pretrained` is that of the policy that ships with the package.
+
     Raises:
         ValueError: nothing there, damaged, or not written by `save_policy`; one line says which.
     """
-    path = Path(path)
+    path = PRETRAINED if str(path) == "pretrained" else Path(path)
     for candidate in (path, path / _PARAMS, path / "best" / _PARAMS):
         if candidate.is_file():
             try:

@@ -19,9 +19,6 @@ from pregrasp_jax.policies import Policy
 from pregrasp_jax.training.console import announced_compilation
 from pregrasp_jax.training.program import enable_compilation_cache
 
-PRETRAINED = Path(__file__).parent.parent / "pretrained"
-"""The policy that ships with the package."""
-
 NUM_ENVS = 16
 """Scenes side by side, enough to keep the engine's threads busy."""
 
@@ -155,12 +152,10 @@ def _load(spec: str) -> Any:
     """Return the trained policy that `spec` names, None for a script."""
     if spec in policies.SCRIPTS:
         return None
-    if spec == "pretrained":
-        return load_policy(PRETRAINED)
-    if not Path(spec).exists():
-        names = ", ".join([*policies.SCRIPTS, "pretrained"])
-        raise ValueError(f"policy {spec} does not exist; allowed: {names}, or a run folder of train.py")
-    return load_policy(spec)
+    if spec == "pretrained" or Path(spec).exists():
+        return load_policy(spec)
+    names = ", ".join([*policies.SCRIPTS, "pretrained"])
+    raise ValueError(f"policy {spec} does not exist; allowed: {names}, or a run folder of train.py")
 
 
 def _environment_config(request: EvaluationConfig, trained: Config) -> Config:

@@ -165,7 +165,7 @@ def learn(
     input_fn: InputFn,
     importance_exponent: jax.Array | float,
     priority_exponent: float,
-    augment_fn: AugmentFn | None = None,
+    augment_fn: AugmentFn = lambda key, inputs, action: (inputs, action),
     split_fn: Callable[[Batch], Batch] = lambda batch: batch,
     **update_options: Any,
 ) -> tuple[LearnerState, Replay, dict[str, jax.Array]]:
@@ -188,9 +188,8 @@ def learn(
         replay, sample_key, batch_size=batch_size, importance_exponent=importance_exponent, input_fn=input_fn
     )
     batch = split_fn(batch)
-    if augment_fn is not None:
-        inputs, action = augment_fn(augment_key, batch.inputs, batch.action)
-        batch = batch.replace(inputs=inputs, action=action)
+    inputs, action = augment_fn(augment_key, batch.inputs, batch.action)
+    batch = batch.replace(inputs=inputs, action=action)
     state, errors, metrics = update(state, batch, **update_options)
     replay = replay_lib.set_priorities(replay, batch.rows, errors, priority_exponent=priority_exponent)
     return state, replay, metrics

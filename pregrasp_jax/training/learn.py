@@ -101,7 +101,7 @@ def make_update(
     q_at_fn: QAtFn,
     mask_fn: MaskFn,
     input_fn: InputFn,
-    augment_fn: AugmentFn | None,
+    augment_fn: AugmentFn,
     optimizer: optax.GradientTransformation,
     config: LearnerConfig,
     replay_config: ReplayConfig,

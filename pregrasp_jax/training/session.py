@@ -35,7 +35,7 @@ def train(config: Config, run_dir: Path, *, init_from: Path | None = None, conso
     Args:
         config: the run.
         run_dir: new or empty folder.
-        init_from: run or policy whose parameters are the initial ones; drawn from the seed if None.
+        init_from: run or policy (`load_policy`) whose parameters are the initial ones; drawn from the seed if None.
         console: told about progress.
 
     Returns:
