@@ -10,7 +10,7 @@ demo: $(INSTALLED)
 	$(BIN)/python -m pregrasp_jax demo
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

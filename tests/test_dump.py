@@ -119,7 +119,6 @@ def replay(env) -> Any:
     return make_replay(env)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("what", ["flung", "nan"])
 def test_a_dump_repeats_the_push_bit_for_bit(env, dumps, replay, what):
     dump = load_dump(dumps[what])
@@ -146,7 +145,6 @@ ALTERED = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ALTERED)
 def test_what_is_not_the_push_of_the_training_is_noticed(env, dumps, replay, name):
     """Every array of the dump that a push depends on, one altered at a time."""
@@ -177,7 +175,6 @@ def run_command(monkeypatch: Any, *arguments: str) -> None:
     package.main()
 
 
-@pytest.mark.slow
 def test_the_command_says_what_happened_and_draws_it(dumps, tmp_path, monkeypatch, capsys):
     run_command(monkeypatch, str(dumps["flung"]), "--png", str(tmp_path / "push.png"))
     _, *lines, wrote = capsys.readouterr().out.splitlines()
@@ -199,7 +196,6 @@ def test_the_command_pushes_on_mjx_too(dumps, monkeypatch, capsys):
     assert said["same"] == "not comparable: on mjx, from rounded coordinates"
 
 
-@pytest.mark.slow
 def test_a_file_of_numbers_only(dumps):
     """Readable without this package, and nothing in it is pickled."""
     with np.load(dumps["flung"], allow_pickle=False) as file:
@@ -209,7 +205,6 @@ def test_a_file_of_numbers_only(dumps):
     assert dumps["flung"].stat().st_size < 20_000
 
 
-@pytest.mark.slow
 def test_arrays_that_do_not_fit_are_named(env, dumps, tmp_path):
     dump = load_dump(dumps["flung"])
     for name, array in (("state/p1", np.zeros(3, np.float32)), ("action", np.float32(3))):
