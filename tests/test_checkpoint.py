@@ -172,6 +172,39 @@ def test_a_lost_chunk_is_written_again_while_the_ring_still_holds_it(tmp_path):
     assert trees.checksum(restore(tmp_path).ring) == trees.checksum(empty_ring(9).contents)
 
 
+@pytest.mark.parametrize("damage", [flip_byte, Path.unlink], ids=["altered", "missing"])
+def test_a_lost_chunk_that_all_checkpoints_share_costs_its_observations_and_no_checkpoint(tmp_path, damage):
+    """The first chunk holds the observations 0 to 3; at 12 observations the ring of 10 has overwritten two of them."""
+    for step, written in ((1, 4), (2, 9), (3, 12)):
+        save(tmp_path, step, written)
+    shared = tmp_path / "replay" / "000000000000-000000000004.npz"
+    damage(shared)
+    restored = restore(tmp_path)
+    assert (restored.step, len(restored.problems)) == (3, 1) and str(shared) in restored.problems[0]
+    assert list(np.flatnonzero(restored.lost)) == [2, 3]
+    expected = np.array(make_ring(12).contents["height"])
+    expected[[2, 3]] = 0
+    np.testing.assert_array_equal(restored.ring["height"], expected)
+    again = restore(tmp_path)
+    np.testing.assert_array_equal(again.lost, restored.lost)
+    for step, written in ((4, 12), (5, 13), (6, 13)):
+        ring = Ring({name: jnp.asarray(leaf) for name, leaf in restored.ring.items()}, written)
+        state.save(tmp_path, step, make_tree(step), ring, {})
+    final = restore(tmp_path)
+    assert final.step == 6 and final.problems == () and not final.lost.any()
+
+
+def test_what_was_lost_does_not_stop_a_newer_state_from_being_damaged_too(tmp_path):
+    _, _, newest = (save(tmp_path, step, written) for step, written in ((1, 4), (2, 9), (3, 12)))
+    (tmp_path / "replay" / "000000000000-000000000004.npz").unlink()
+    flip_byte(newest / "state.safetensors")
+    restored = restore(tmp_path)
+    assert restored.step == 2 and restored.lost.sum() == 4
+    state_problem, chunk_problem = restored.problems
+    assert "state.safetensors is cut" in state_problem and "replay chunk" in chunk_problem
+    assert not newest.exists() and (tmp_path / "000000001").exists()
+
+
 def test_refusals_are_one_line(tmp_path):
     with pytest.raises(ValueError, match="holds no checkpoint"):
         restore(tmp_path)

@@ -1,6 +1,20 @@
 """What a training says on the console."""
 
-from pregrasp_jax.training.console import describe, format_time
+import os
+
+from pregrasp_jax.training.console import Console, describe, format_time
+
+
+def test_a_log_on_a_full_disk_and_a_reader_that_is_gone_stop_nothing():
+    reader, writer = os.pipe()
+    os.close(reader)
+    for stream in (open("/dev/full", "w", buffering=1), os.fdopen(writer, "w", buffering=1)):  # noqa: SIM115
+        console = Console(stream)
+        console.start()
+        for _ in range(3):
+            console.say("x" * 10_000)
+        console.close()
+        os.close(stream.fileno())  # its own `close` would try once more
 
 
 def test_the_console_line():

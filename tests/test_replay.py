@@ -208,6 +208,28 @@ def test_hindsight_rows_stay_aligned_and_die_with_their_observations(capacity):
     assert real == {row["obs"] for row in world.transitions if row["obs"] in kept and row["next_obs"] in kept}
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_refers_to_lost_observations_is_forgotten_now_and_later(seed):
+    """An episode under way keeps nothing of what is lost, also when hindsight relabels it at its end."""
+    world = World(seed, enclose=0.5)
+    memory = fill(world, empty(64), 50)
+    numbers = read_image(memory.observations)
+    lost = np.zeros(64, bool)
+    lost[np.random.default_rng(seed).choice(64, 20, replace=False)] = True
+    lost[int(memory.episodes.obs_slot[0])] = True
+    gone = set(numbers[lost])
+    expected = [row for row in alive_rows(memory) if not gone & set(row[:2])]
+    memory = replay.forget(memory, jnp.asarray(lost))
+    assert alive_rows(memory) == expected and len(expected) > 5
+    memory = fill(world, memory, 6)
+    before = len(world.transitions) - 6 * NUM_ENVS
+    rows = [row for row in alive_rows(memory) if not row[-1]]
+    later = {row["obs"] for row in world.transitions[before:]}
+    assert later <= {row[0] for row in rows}, "what comes afterwards is all there"
+    assert not gone & {row[0] for row in alive_rows(memory) if row[0] not in later}
+    assert not gone & {row[1] for row in alive_rows(memory)}
+
+
 def test_the_ring_of_rows_never_overwrites_a_row_that_is_alive():
     """At the smallest capacity, with most episodes relabelled: rows that die, die with an observation."""
     world = World(3, enclose=0.6)

@@ -200,15 +200,15 @@ def test_processes_that_were_told_something_else_are_refused(monkeypatch):
 def test_a_watched_folder_is_only_read(tmp_path):
     config = make_config(3, 0)
     with RunFolder.create(tmp_path / "run", config) as folder:
-        folder.begin_session({})
+        folder.begin_session(config, {})
         before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
         trainer = make_trainer(
             tmp_path / "run", config, begin=False, env=PictureEnv(), folder=WatchedFolder(folder.path)
         )
         with trainer.folder:
-            trainer.folder.begin_session({"hull bank": "another"})
+            trainer.folder.begin_session(config, {"hull bank": "another"})
             trainer.begin()
             trainer.run(never)
-            trainer.folder.forget_metrics_after(0)
+            trainer.folder.forget_metrics_after(0, evaluated_at=None)
         assert trainer.saved and trainer.progress.best == 0.25
         assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before

@@ -46,7 +46,7 @@ def test_a_box_becomes_one_line(frame):
 
 
 LISTENER = """
-import hashlib, sys, time
+import hashlib, os, sys, time
 from pregrasp_jax.training.interrupt import Interrupt
 with Interrupt(lambda line: print(line, flush=True), lambda: print("cursor back", flush=True)) as interrupt:
     print("ready", flush=True)
@@ -55,6 +55,8 @@ with Interrupt(lambda line: print(line, flush=True), lambda: print("cursor back"
         hashlib.pbkdf2_hmac("sha256", b"", b"", 10**8)
     while interrupt.exit_code is None:
         time.sleep(0.01)
+    if sys.argv[1] == "deaf":
+        os._exit(interrupt.exit_code)
     print("stopped by the loop", flush=True)
     sys.exit(interrupt.exit_code)
 """
@@ -72,6 +74,14 @@ def test_the_first_signal_asks_the_loop_to_stop(number, code):
     process.send_signal(number)
     output, _ = process.communicate(timeout=20)
     assert process.returncode == code and "stopping" in output and output.endswith("stopped by the loop\n")
+
+
+def test_a_signal_counts_though_it_cannot_be_answered():
+    process = _listener("deaf")
+    assert process.stdout
+    process.stdout.close()
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=20) == 143
 
 
 def test_the_second_signal_ends_a_busy_process_at_once():

@@ -144,8 +144,11 @@ def test_a_run_can_be_extended_but_not_changed(tmp_path):
     path, config = tmp_path / "run", make_config(episodes=6)
     first = run(path, config)
     longer = dataclasses.replace(config, train=dataclasses.replace(config.train, episodes=14))
+    with RunFolder.open(path, longer) as folder:
+        assert stored_config(path) == config, "until objects, scenes and resources have been found to do"
+        folder.begin_session(longer, {})
+        assert stored_config(path) == longer
     assert run(path, longer, resume=True).progress.episodes >= 14 > first.progress.episodes
-    assert stored_config(path) == longer
     changed = dataclasses.replace(longer, exploration=ExplorationConfig(guided=False))
     with pytest.raises(ValueError, match=r"exploration.guided: True -> False.*allowed to change: train.minutes"):
         RunFolder.open(path, changed)
@@ -168,23 +171,6 @@ def test_a_run_that_died_in_its_last_evaluation_has_it_when_it_is_resumed(tmp_pa
     assert not (path / "best").exists()
     run(path, config, resume=True)
     assert load_policy(path).evaluation["success_rate"] == 0.25
-
-
-def test_a_folder_is_used_by_one_process(tmp_path):
-    config = make_config()
-    with (
-        RunFolder.create(tmp_path / "run", config),
-        pytest.raises(ValueError, match=r"in use by process \d+; allowed is one process at a time"),
-    ):
-        RunFolder.open(tmp_path / "run", config)
-    RunFolder.open(tmp_path / "run", config)
-
-
-def test_a_run_keeps_its_objects_and_scenes(tmp_path):
-    with RunFolder.create(tmp_path / "run", make_config()) as folder:
-        folder.begin_session({"hull bank": "a", "training scenes": "b"})
-        with pytest.raises(ValueError, match=r"another training scenes \(b, now c\)"):
-            folder.begin_session({"hull bank": "a", "training scenes": "c"})
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):

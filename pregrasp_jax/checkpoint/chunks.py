@@ -9,6 +9,7 @@ import hashlib
 import io as bytes_io
 import zipfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,26 +71,49 @@ def append(folder: Path, ring: Ring, known: list[Chunk]) -> list[Chunk]:
     return sorted(kept + [_write(folder, leaves, piece) for piece in _missing(first, ring.written, kept)])
 
 
-def restore(folder: Path, template: Any, written: int, chunks: list[Chunk]) -> Any:
-    """Return the contents of the ring, in fresh device arrays; slots that were never written are 0.
+def restore(folder: Path, template: Any, written: int, chunks: list[Chunk]) -> tuple[Any, np.ndarray, list[str]]:
+    """Read the observations back.
+
+    Returns:
+        The contents of the ring, in fresh device arrays, 0 where they are lost or were never written; the slots
+        [capacity] bool that are lost, because a chunk is missing, cut short or altered, or the chunks leave a gap; and
+        one line for each such problem.
 
     Raises:
-        DamagedFileError: a chunk is missing, cut short or altered, or the chunks leave a gap.
         ValueError: the ring has another capacity or shape.
     """
     shapes = zip(leaf_names(template), jax.tree.leaves(template), strict=True)
     leaves = {name: np.zeros(like.shape, like.dtype) for name, like in shapes}
     capacity = next(iter(leaves.values())).shape[0]
-    for gap in _missing(max(0, written - capacity), written, chunks):
-        raise DamagedFileError(f"{folder}: no chunk holds the observations {gap.start} to {gap.stop - 1}")
+    first = max(0, written - capacity)
+    lost, problems = np.zeros(capacity, bool), []
+    for gap in _missing(first, written, chunks):
+        lost[np.arange(gap.start, gap.stop) % capacity] = True
+        problems.append(f"{folder}: no chunk holds the observations {gap.start} to {gap.stop - 1}")
     for chunk in sorted(chunks):
-        arrays = _read(folder / chunk.name, chunk)
-        slots = np.arange(chunk.start, chunk.stop) % capacity
+        live = np.arange(max(first, chunk.start), chunk.stop)
+        try:
+            arrays = _read(folder / chunk.name, chunk)
+        except DamagedFileError as error:
+            lost[live % capacity] = True
+            problems.append(str(error))
+            continue
+        length = chunk.stop - chunk.start
         for name, leaf in leaves.items():
-            if name not in arrays or arrays[name].shape != (len(slots), *leaf.shape[1:]):
-                raise ValueError(f"{folder / chunk.name}: {name} is not [{len(slots)}, {leaf.shape[1:]}]")
-            leaf[slots] = arrays[name]
-    return rebuild(template, leaves, origin=str(folder))
+            if name not in arrays or arrays[name].shape != (length, *leaf.shape[1:]):
+                raise ValueError(f"{folder / chunk.name}: {name} is not [{length}, {leaf.shape[1:]}]")
+            leaf[live % capacity] = arrays[name][live - chunk.start]
+    return rebuild(template, leaves, origin=str(folder)), lost, problems
+
+
+def set_aside(folder: Path, chunks: list[Chunk]) -> None:
+    """Rename the files of `chunks` that are damaged, so that they are written anew."""
+    for chunk in chunks:
+        try:
+            _read(folder / chunk.name, chunk)
+        except DamagedFileError:
+            with suppress(FileNotFoundError):
+                (folder / chunk.name).rename(folder / f"{chunk.name}.damaged")
 
 
 def collect_garbage(folder: Path, referenced: set[str]) -> None:

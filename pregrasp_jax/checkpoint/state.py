@@ -5,7 +5,8 @@
                   manifest.json         written last: without it the checkpoint does not exist
         replay/000000000000-....npz     observations, append-only (see `chunks`)
 
-Every file carries a checksum. A damaged checkpoint is set aside and the one before it is used.
+Every file carries a checksum. A damaged checkpoint is set aside and the one before it is used. Checkpoints share the
+observations; only if damage to these leaves none whole is the newest used without what is lost.
 """
 
 import dataclasses
@@ -42,13 +43,15 @@ class Restored:
         tree: the state.
         ring: the observations.
         extra: what `save` was given.
-        problems: one line for every newer checkpoint that was damaged and has been set aside.
+        lost: [capacity] bool, slots of the ring whose observations no intact file holds; they are 0.
+        problems: one line for everything that was damaged and has been set aside.
     """
 
     step: int
     tree: Any
     ring: Any
     extra: dict[str, Any]
+    lost: np.ndarray
     problems: tuple[str, ...]
 
 
@@ -71,9 +74,10 @@ def save(folder: Path, step: int, tree: Any, ring: Ring, extra: dict[str, Any]) 
         OSError: the disk is full; nothing of this checkpoint is left.
     """
     target = folder / f"{step:09d}"
-    known = {chunk for path in _newest_first(folder) for chunk in _listed_chunks(path)}
+    # Of a chunk that was lost and written anew, the newest checkpoint knows the right checksum.
+    known = {chunk.name: chunk for path in reversed([*_newest_first(folder)]) for chunk in _listed_chunks(path)}
     try:
-        current = chunks.append(folder / _REPLAY, ring, sorted(known))
+        current = chunks.append(folder / _REPLAY, ring, sorted(known.values()))
         state = trees.encode(trees.named_leaves(tree))
         # A checkpoint of the same step stays valid meanwhile: the state of a step is always the same.
         io.write_bytes(target / _STATE, state)
@@ -100,6 +104,8 @@ def exists(folder: Path) -> bool:
 def restore(folder: Path, template: Any, ring_template: Any) -> Restored:
     """Read the newest intact checkpoint; damaged ones are renamed to ``*.damaged`` and reported.
 
+    If none is intact, but the state of one is, that is used without the observations that are lost.
+
     Args:
         folder: the run's `checkpoints`.
         template: tree like the one given to `save`; arrays or `jax.ShapeDtypeStruct`.
@@ -109,29 +115,55 @@ def restore(folder: Path, template: Any, ring_template: Any) -> Restored:
         ValueError: there is no checkpoint, none is intact, or it belongs to another configuration.
     """
     damaged: dict[Path, str] = {}
+    partial: list[Path] = []
     for path in _newest_first(folder):
         try:
-            manifest = _read_manifest(path)
-            tree = trees.rebuild(template, _read_state(path, manifest), origin=str(path / _STATE))
-            listed = [Chunk(*row) for row in manifest["chunks"]]
-            ring = chunks.restore(folder / _REPLAY, ring_template, manifest["observations"], listed)
+            restored = _read(path, template, ring_template)
         except DamagedFileError as error:
             damaged[path] = str(error)
             continue
-        except ValueError as error:
-            raise ValueError(
-                f"{error}; allowed is a checkpoint of the same configuration and version; --init-from starts a new run "
-                "from its parameters"
-            ) from None
+        if restored.problems:
+            partial.append(path)
+            damaged[path] = restored.problems[0]
+            continue
         for broken in damaged:
             _set_aside(broken)
-        return Restored(manifest["step"], tree, ring, manifest["extra"], tuple(damaged.values()))
+        return dataclasses.replace(restored, problems=tuple(damaged.values()))
+    if partial:
+        return _settle_for(partial[0], damaged, template, ring_template)
     if damaged:
         raise ValueError(
             f"{folder}: none of {len(damaged)} checkpoints is intact; newest: {next(iter(damaged.values()))}; allowed "
             "is a run with one that is; --init-from starts a new run from its best policy"
         )
     raise ValueError(f"{folder} holds no checkpoint")
+
+
+def _read(path: Path, template: Any, ring_template: Any) -> Restored:
+    """Read one checkpoint; what is wrong with its observations is listed, not raised."""
+    try:
+        manifest = _read_manifest(path)
+        tree = trees.rebuild(template, _read_state(path, manifest), origin=str(path / _STATE))
+        listed = [Chunk(*row) for row in manifest["chunks"]]
+        ring, lost, problems = chunks.restore(path.parent / _REPLAY, ring_template, manifest["observations"], listed)
+    except DamagedFileError:
+        raise
+    except ValueError as error:
+        raise ValueError(
+            f"{error}; allowed is a checkpoint of the same configuration and version; --init-from starts a new run "
+            "from its parameters"
+        ) from None
+    return Restored(manifest["step"], tree, ring, manifest["extra"], lost, tuple(problems))
+
+
+def _settle_for(path: Path, damaged: dict[Path, str], template: Any, ring_template: Any) -> Restored:
+    """Return a checkpoint without the observations that are lost, and set aside the newer ones and these files."""
+    restored = _read(path, template, ring_template)
+    newer = [broken for broken in damaged if int(broken.name) > restored.step]
+    for broken in newer:
+        _set_aside(broken)
+    chunks.set_aside(path.parent / _REPLAY, _listed_chunks(path))
+    return dataclasses.replace(restored, problems=(*(damaged[broken] for broken in newer), *restored.problems))
 
 
 def read_newest_arrays(folder: Path) -> tuple[dict[str, np.ndarray], Path]:

@@ -292,6 +292,21 @@ def set_priorities(replay: Replay, rows: jax.Array, td_errors: jax.Array, *, pri
     return replay.replace(priorities=sum_tree.set_leaves(replay.priorities, rows, jnp.where(alive, priority, 0.0)))
 
 
+def forget(replay: Replay, lost: jax.Array) -> Replay:
+    """Let the rows die that refer to observations whose slots are `lost` [capacity] bool.
+
+    An episode under way of which something is lost begins anew, for the memory, with its next push.
+    """
+    rows, episodes = replay.rows, replay.episodes
+    stale = lost[rows.obs_slot] | lost[rows.next_obs_slot]
+    made = jnp.arange(episodes.rows.shape[1])[None] < episodes.length[:, None]
+    broken = lost[episodes.obs_slot] | jnp.any(made & stale[episodes.rows], axis=1)
+    return replay.replace(
+        priorities=sum_tree.build(jnp.where(stale, 0.0, replay.priorities.leaves)),
+        episodes=episodes.replace(ended=episodes.ended | broken),
+    )
+
+
 def _importance_weights(replay: Replay, slots: jax.Array, exponent: jax.Array | float) -> jax.Array:
     """Return (1 / (N p))^exponent over its largest in the batch, [B]."""
     priority = replay.priorities.leaves[slots]

@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
 from rich.console import Console as RichConsole
@@ -13,8 +13,27 @@ PLAIN_INTERVAL = 10.0
 """s between plain lines: a log file is read, not watched."""
 
 
+class _Forgiving:
+    """A stream on which nothing fails: a log on a full disk, or a reader that has gone, must not stop a training."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
 class Console:
-    """Says what a training does."""
+    """Says what a training does, as long as somebody can hear it."""
 
     def __init__(self, stream: TextIO | None = None):
         """Choose live or plain.
@@ -22,7 +41,8 @@ class Console:
         Args:
             stream: standard output if None.
         """
-        self._rich = RichConsole(file=stream or sys.stdout, highlight=False, soft_wrap=True)
+        heard: Any = _Forgiving(stream or sys.stdout)
+        self._rich = RichConsole(file=heard, highlight=False, soft_wrap=True)
         self._last_line = -PLAIN_INTERVAL
         self._progress = Progress(
             TextColumn("{task.percentage:3.0f} %"),

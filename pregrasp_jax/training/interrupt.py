@@ -58,10 +58,12 @@ class Interrupt:
 
     def _answer(self, number: int) -> None:
         if self._signal is not None:
-            self._before_exit()
-            os._exit(128 + number)
-        self._say("stopping: this step is finished and a checkpoint is written; a second signal ends at once")
+            try:
+                self._before_exit()
+            finally:
+                os._exit(128 + number)
         self._signal = number
+        self._say("stopping: this step is finished and a checkpoint is written; a second signal ends at once")
 
 
 def _ignore(number: int, frame: FrameType | None) -> None:

@@ -58,6 +58,11 @@ class RunFolder:
         return self.path / "dumps"
 
     @property
+    def metrics(self) -> Path:
+        """File of the rows of metrics."""
+        return self.path / "metrics.jsonl"
+
+    @property
     def best(self) -> Path:
         """Folder of the best policy."""
         return self.path / "best"
@@ -83,7 +88,8 @@ class RunFolder:
             config: its configuration, up to `EXTENDABLE`.
 
         Raises:
-            ValueError: no run, in use by another process, or another configuration; the latter lists the difference.
+            ValueError: no run, one that has lost its checkpoints, in use by another process, or another configuration;
+                the latter lists the difference.
         """
         changed = difference(stored_config(path), config)
         if refused := [line for line in changed if line.split(":")[0] not in EXTENDABLE]:
@@ -92,9 +98,12 @@ class RunFolder:
                 f"{', '.join(EXTENDABLE)}; --init-from starts a new run from its parameters"
             )
         folder = cls(path, _locked(path))
+        if not folder.has_checkpoint and (folder.best.exists() or folder.metrics.exists()):
+            raise ValueError(
+                f"run {path} has lost its checkpoints; allowed is a run with one in {folder.checkpoints}; --init-from "
+                "starts a new run from its best policy"
+            )
         io.sweep(path)
-        if changed:
-            write_config(path / "config.yaml", config)
         return folder
 
     def __enter__(self) -> "RunFolder":
@@ -106,20 +115,23 @@ class RunFolder:
         if self._lock:
             self._lock.close()
 
-    def begin_session(self, hashes: dict[str, str]) -> None:
-        """Record versions, machine and hashes; call it before anything else is written.
+    def begin_session(self, config: Config, hashes: dict[str, str]) -> None:
+        """Record configuration, versions, machine and hashes; call it before anything else is written.
 
         Raises:
             ValueError: the run began with other objects or scenes, or its manifest is damaged.
         """
         file = self.path / "manifest.json"
         manifest = _read_manifest(file) if file.exists() else {"hashes": hashes, "sessions": []}
-        if manifest["hashes"] != hashes:
-            odd = [name for name in hashes if manifest["hashes"].get(name) != hashes[name]]
-            raise ValueError(
-                f"run {self.path} began with another {odd[0]} ({manifest['hashes'].get(odd[0])}, now "
-                f"{hashes[odd[0]]}); resume it with the same objects, MuJoCo and package version"
-            )
+        then = manifest["hashes"]
+        for name in then | hashes:
+            if then.get(name) != hashes.get(name):
+                raise ValueError(
+                    f"run {self.path} began with another {name} ({then.get(name)}, now {hashes.get(name)}); resume it "
+                    "with the same objects, MuJoCo and package version"
+                )
+        if difference(stored_config(self.path), config):
+            write_config(self.path / "config.yaml", config)
         session = {
             "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "versions": versions(),
@@ -138,7 +150,7 @@ class RunFolder:
             OSError: the disk is full.
         """
         data = (json.dumps(row, allow_nan=False) + "\n").encode()
-        with (self.path / "metrics.jsonl").open("ab", buffering=0) as file:
+        with self.metrics.open("ab", buffering=0) as file:
             length = file.tell()
             if file.write(data) < len(data):  # what a full disk does at first; only the next write raises
                 file.truncate(length)
@@ -146,12 +158,21 @@ class RunFolder:
         if self._event_log:
             self._event_log.append(row)
 
-    def forget_metrics_after(self, env_steps: int) -> None:
-        """Drop the rows later than a checkpoint, which will be measured again, and a last line that was cut."""
-        file = self.path / "metrics.jsonl"
-        if file.exists():
-            kept = [line for line in file.read_text(errors="replace").splitlines() if _env_steps(line) <= env_steps]
-            io.write_bytes(file, "".join(f"{line}\n" for line in kept).encode())
+    def forget_metrics_after(self, env_steps: int, *, evaluated_at: int | None) -> None:
+        """Drop the rows later than a checkpoint, which will be measured again, and a last line that was cut.
+
+        Args:
+            env_steps: of the checkpoint.
+            evaluated_at: env steps of the last evaluation that the checkpoint knows of.
+        """
+
+        def known(line: str) -> bool:
+            step, evaluation = _describe_row(line)
+            return step <= env_steps and (not evaluation or step < env_steps or evaluated_at == step)
+
+        if self.metrics.exists():
+            kept = [line for line in self.metrics.read_text(errors="replace").splitlines() if known(line)]
+            io.write_bytes(self.metrics, "".join(f"{line}\n" for line in kept).encode())
 
 
 class WatchedFolder(RunFolder):
@@ -163,7 +184,7 @@ class WatchedFolder(RunFolder):
         """Lock nothing."""
         super().__init__(path, None)
 
-    def begin_session(self, hashes: dict[str, str]) -> None:
+    def begin_session(self, config: Config, hashes: dict[str, str]) -> None:
         """Record nothing."""
 
     def begin_event_log(self, *, resumed_at: int | None = None) -> None:
@@ -172,7 +193,7 @@ class WatchedFolder(RunFolder):
     def append_metrics(self, row: dict[str, Any]) -> None:
         """Append nothing."""
 
-    def forget_metrics_after(self, env_steps: int) -> None:
+    def forget_metrics_after(self, env_steps: int, *, evaluated_at: int | None) -> None:
         """Drop nothing."""
 
 
@@ -228,11 +249,13 @@ def _read_manifest(file: Path) -> dict[str, Any]:
         ) from None
 
 
-def _env_steps(line: str) -> float:
+def _describe_row(line: str) -> tuple[float, bool]:
+    """Return the env steps of a row of metrics, infinite if it is damaged, and whether it is an evaluation."""
     try:
-        return json.loads(line)["env_steps"]
+        row = json.loads(line)
+        return row["env_steps"], "eval/success_rate" in row
     except (json.JSONDecodeError, KeyError, TypeError):
-        return float("inf")
+        return float("inf"), False
 
 
 def _locked(path: Path) -> TextIO:
@@ -244,11 +267,16 @@ def _locked(path: Path) -> TextIO:
         raise ValueError(f"run folder {path} cannot be written ({error.strerror})") from None
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         file.seek(0)
         holder = file.read().strip() or "unknown"
         file.close()
         raise ValueError(f"run folder {path} is in use by process {holder}; allowed is one process at a time") from None
+    except OSError as error:
+        file.close()
+        raise ValueError(
+            f"run folder {path} cannot be locked ({error.strerror}); allowed is a file system with locks"
+        ) from None
     file.truncate(0)
     file.write(f"{os.getpid()}\n")
     file.flush()

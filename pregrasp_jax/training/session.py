@@ -79,7 +79,7 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
     resumed, folder = folder is not None, folder or _create(run_dir, config)
     trainer = Trainer(config, folder, program, make_evaluate(validation, config), make_dump(env, config), console)
     with folder, Interrupt(console.say, console.close) as interrupt:
-        folder.begin_session(hashes)
+        folder.begin_session(config, hashes)
         (trainer.resume if processes.agreed(resumed and folder.has_checkpoint) else trainer.begin)()
         try:
             ending = trainer.run(lambda: interrupt.exit_code is not None)

@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax import exploration
-from pregrasp_jax.checkpoint import restore, save, save_policy
+from pregrasp_jax.checkpoint import Restored, restore, save, save_policy
 from pregrasp_jax.config import Config
 from pregrasp_jax.learning.learner import Params
+from pregrasp_jax.learning.replay import forget
 from pregrasp_jax.training import collect, learn, processes
 from pregrasp_jax.training.console import Console, announced_compilation, format_time
 from pregrasp_jax.training.dump import DumpFn
@@ -123,14 +125,27 @@ class Trainer:
             restored = restore(self.folder.checkpoints, template, ring)
         for problem in restored.problems:
             self.console.say(f"warning: {problem}; going on from the checkpoint of step {restored.step}")
-        self.state = self.program.place(restored.tree.join(restored.ring))
+        self.state = self.program.place(self._without_lost(restored))
         self.progress = Progress(**restored.extra)
-        self.folder.forget_metrics_after(restored.step)
+        self.folder.forget_metrics_after(restored.step, evaluated_at=self.progress.evaluated_at)
         if self.config.train.tensorboard:
             self.folder.begin_event_log(resumed_at=restored.step)
         self._saved_at, self._tried_to_save_at, self._unsaved = restored.step, self.progress.total_seconds, False
         self._logged_at = (restored.step, self.progress.total_seconds)
         self.console.say(f"resuming {self.folder.path} at step {restored.step}, episode {self.progress.episodes}")
+
+    def _without_lost(self, restored: Restored) -> TrainState:
+        """Return the state of a checkpoint; what refers to observations that are lost is forgotten."""
+        state: TrainState = restored.tree.join(restored.ring)
+        if not restored.lost.any():
+            return state
+        replay = forget(state.learning.replay, jnp.asarray(restored.lost))
+        rows = int(state.learning.replay.num_alive - replay.num_alive)
+        self.console.say(
+            f"warning: {restored.lost.sum()} observations are lost, and {rows} transitions with them; the run goes on, "
+            "but not as it would have"
+        )
+        return state.replace(learning=state.learning.replace(replay=replay))
 
     def run(self, stop: Callable[[], bool]) -> str:
         """Train until a limit is reached or `stop`, asked before every step, returns True.
@@ -267,10 +282,13 @@ class Trainer:
         row |= {f"eval/{name}": value for name, value in measured.items()}
         self._write("metrics", lambda: self.folder.append_metrics(row))
         if progress.best is None or measured["success_rate"] >= progress.best:
-            progress.best = measured["success_rate"]
-            self._write("policy", lambda: save_policy(self.folder.best, params, self.config, where | measured))
-        rate = f"success {measured['success_rate']:.0%} (best {progress.best:.0%})"
-        self.console.say(f"validation at step {progress.env_steps}: {rate}")
+            written = self._write(
+                "policy", lambda: save_policy(self.folder.best, params, self.config, where | measured)
+            )
+            if processes.agreed(written):
+                progress.best = measured["success_rate"]
+        best = "none kept" if progress.best is None else f"best {progress.best:.0%}"
+        self.console.say(f"validation at step {progress.env_steps}: success {measured['success_rate']:.0%} ({best})")
 
     def save(self) -> None:
         """Write a checkpoint, unless this step has one."""

@@ -3,19 +3,20 @@
 import errno
 import io as text_io
 import os
+import re
 import resource
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fake_training import make_config, make_trainer, rows, run, stop_after, timeless
+from fake_training import make_config, make_trainer, never, rows, run, stop_after, timeless
 
-from pregrasp_jax.checkpoint import Ring, checksum, restore, save
+from pregrasp_jax.checkpoint import Ring, checksum, load_policy, restore, save
 from pregrasp_jax.training.run_folder import RunFolder
 from pregrasp_jax.training.trainer import Trainer
 
@@ -198,6 +199,44 @@ def test_damage_costs_one_checkpoint_and_is_said(tmp_path, stopped, victim, dama
         first, second = console.getvalue().splitlines()
     assert first == f"warning: {said.format(file=file)}; going on from the checkpoint of step 12"
     assert second.startswith(f"resuming {path} at step 12, episode ")
+
+
+@pytest.mark.parametrize("damage", [flip_byte, Path.unlink])
+def test_an_old_chunk_that_is_lost_costs_what_refers_to_it_and_the_run_goes_on(tmp_path, stopped, damage):
+    path = tmp_path / "run"
+    shutil.copytree(stopped, path)
+    oldest = min(path.glob("checkpoints/replay/*.npz"))
+    damage(oldest)
+    console = text_io.StringIO()
+    trainer = make_trainer(path, CONFIG, resume=True, said=console)
+    damaged, lost, resuming = console.getvalue().splitlines()
+    assert damaged.startswith(f"warning: replay chunk {oldest} ") and damaged.endswith("of step 15")
+    assert re.fullmatch(
+        r"warning: [1-9]\d* observations are lost, and [1-9]\d* transitions with them; the run .*", lost
+    )
+    assert resuming.startswith(f"resuming {path} at step 15, episode ")
+    with trainer.folder:
+        trainer.run(never)
+    assert make_trainer(path, CONFIG, resume=True, said=console).progress.episodes >= CONFIG.train.episodes
+    assert console.getvalue().count("observations are lost") == 1
+
+
+def test_a_policy_that_could_not_be_written_is_not_the_best(tmp_path):
+    """0.9 while the disk is full; the 0.5 after it must be kept instead."""
+    said, path, scores = text_io.StringIO(), tmp_path / "disk" / "run", iter([0.3, 0.9, 0.5])
+    with pretended_disk(tmp_path / "disk") as full:
+        trainer = make_trainer(path, CONFIG, said=said)
+        trainer.evaluate_fn = lambda params: {"success_rate": next(scores)}
+        for disk in (nullcontext(), full(), nullcontext()):
+            with disk:
+                trainer._step(trainer.program)
+                trainer.evaluate()
+    assert [line.split(": ")[1] for line in said.getvalue().splitlines() if line.startswith("validation")] == [
+        "success 30% (best 30%)",
+        "success 90% (best 30%)",
+        "success 50% (best 50%)",
+    ]
+    assert load_policy(path).evaluation["success_rate"] == 0.5
 
 
 def test_a_run_goes_on_from_the_checkpoint_before_the_damaged_one_as_if_nothing_had_happened(tmp_path, stopped, whole):
