@@ -62,7 +62,7 @@ def soak(env: Env, num_pushes: int, config: Config) -> dict[str, Any]:
     params = jax.jit(q.init)(jax.random.key(config.seed))
     make_actors = functools.partial(collect.init_actors, env=env, num_envs=config.train.num_envs)
     actors = jax.jit(make_actors)(jax.random.key(config.seed))
-    push = collect.make_collect(env, q.apply, q.input_fn, config.exploration, warmup=config.learner.warmup)
+    push = collect.make_collect(env, q, config.exploration, warmup=config.learner.warmup)
     push = jax.jit(push, donate_argnums=0).lower(actors, params).compile()
     num_steps = -(-num_pushes // config.train.num_envs)
     marks = {max(1, round(share * num_steps)): f"{share:.0%}" for share in (0.1, 0.5, 1.0)}

@@ -253,7 +253,8 @@ def with_task(env: Env, **changes: object) -> Env:
 def _turn(pose: jax.Array, *, yaw: jax.Array) -> jax.Array:
     """Rotate a pose about the world's z axis."""
     turn = geometry.quat_from_yaw(yaw)
-    position = geometry.quat_to_matrix(turn) @ pose[:3]
+    blank = jnp.concatenate([jnp.zeros(3), turn])
+    position = geometry.transform_points(blank, pose[:3])
     return jnp.concatenate([position, geometry.quat_multiply(turn, pose[3:])])
 
 

@@ -74,10 +74,20 @@ def softmax_action(key: jax.Array, q: jax.Array, mask: jax.Array, *, temperature
     return jax.random.categorical(key, logits.ravel()).astype(jnp.int32)
 
 
-def random_action(key: jax.Array) -> jax.Array:
-    """Draw uniformly from all `grid.NUM_ACTIONS`, inside the half ring or not: the Random-Exp ablation.
+def random_action(key: jax.Array, mask: jax.Array) -> jax.Array:
+    """Draw a push uniformly, open or closed.
+
+    The Random-Exp ablation draws from all cells that the network values, in the half ring or not. One that the hand
+    cannot reach ends the episode.
+
+    Args:
+        key: consumed.
+        mask: [H, W] bool, cells allowed as the end of the push.
 
     Returns:
-        () int32 action. A cell that the hand cannot reach ends the episode, as in the paper's ablation.
+        () int32 action.
     """
-    return jax.random.randint(key, (), 0, grid.NUM_ACTIONS, dtype=jnp.int32)
+    assert mask.shape == (grid.GRID_SIZE, grid.GRID_SIZE), mask.shape
+    key_cell, key_aperture = jax.random.split(key)
+    cell = jax.random.categorical(key_cell, jnp.where(mask, 0.0, -jnp.inf).ravel())
+    return (2 * cell + jax.random.bernoulli(key_aperture)).astype(jnp.int32)

@@ -16,7 +16,7 @@ from jax.tree_util import Partial
 
 from pregrasp_jax import grid
 from pregrasp_jax.env import Env
-from pregrasp_jax.exploration import guided_action
+from pregrasp_jax.exploration import guided_action, random_action
 from pregrasp_jax.judge import TARGET_IN_REGION
 from pregrasp_jax.types import CLOSED, OPEN, EnvState, Observation
 
@@ -43,9 +43,7 @@ def make_random(env: Env) -> Policy:
     """Return the policy that draws a cell of the half ring and an aperture uniformly."""
 
     def act(state: EnvState, key: jax.Array) -> jax.Array:
-        key_cell, key_aperture = jax.random.split(key)
-        cell = jax.random.categorical(key_cell, jnp.where(env.action_mask(state.p1), 0.0, -jnp.inf).ravel())
-        return (2 * cell + jax.random.bernoulli(key_aperture)).astype(jnp.int32)
+        return random_action(key, env.action_mask(state.p1))
 
     return act
 

@@ -136,6 +136,16 @@ def test_requests_override_the_camera_and_more_episodes_need_more_scenes(fake_wo
     assert fake_world[0].scene.test_scenes == 300
 
 
+def test_a_smaller_ring_changes_where_the_shipped_policy_may_push_not_what_it_sees(fake_world: list[Config]) -> None:
+    usual, narrow = (make_player(EvaluationConfig(policy="pretrained", r_out=r_out)) for r_out in (None, 0.12))
+    state = usual.env.reset_to(jax.numpy.int32(0))
+    assert usual.q_values is not None and narrow.q_values is not None
+    np.testing.assert_array_equal(usual.q_values(state), narrow.q_values(state))
+    assert narrow.env.action_mask(state.p1).sum() < usual.env.action_mask(state.p1).sum()
+    with pytest.raises(ValueError, match=r"r_out = 0.25 is out of range; allowed for this policy, .* is 0.04 to 0.2"):
+        make_player(EvaluationConfig(policy="pretrained", r_out=0.25))
+
+
 def test_the_shipped_policy_has_a_name(fake_world: list[Config]) -> None:
     assert make_player(EvaluationConfig(policy="pretrained")).q_values is not None
     assert fake_world[0].network.architecture == "compact"

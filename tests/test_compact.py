@@ -173,6 +173,21 @@ def test_augmented_pushes_are_those_of_the_scene_or_of_its_mirror_image():
     assert seen == {False, True}
 
 
+@pytest.mark.parametrize("hand", [START, (-0.1025, 0.0525), (0.2475, -0.2475)])
+@pytest.mark.parametrize("full_ring", [False, True])
+def test_unguided_exploration_stays_where_the_network_has_values_on_both_sides(hand, full_ring):
+    """A push without a value would never be learned, and be sampled for ever for its error."""
+    config = NetworkConfig(architecture="compact", width=1 / 32, initial_bias=0.2, mirror=True)
+    q = make_q_function(config, TaskConfig(full_ring=full_ring))
+    obs, params = observation(hand), q.init(jax.random.key(0))
+    inputs = jax.tree.map(lambda leaf: leaf[None], q.input_fn(obs, jnp.int32(1)))
+    assert q.mirror_fn is not None
+    here, there = (np.asarray(q.network.apply({"params": params}, x))[0, ..., 0] for x in (inputs, q.mirror_fn(inputs)))
+    np.testing.assert_array_equal(q.domain_fn(obs.p1), (here != 0) & (there[::-1] != 0))
+    mask = primitives.half_ring_mask(obs.p1, r_in=0.04, r_out=0.2, full_ring=full_ring)
+    assert not (mask & ~q.domain_fn(obs.p1)).any()
+
+
 def test_untrained_it_promises_its_bias_everywhere_and_learns_in_every_layer():
     config = PRESETS["cpu"]
     q = make_q_function(config.network, config.task)

@@ -93,8 +93,12 @@ def test_an_empty_mask_still_gives_an_action():
     assert 0 <= int(action) < grid.NUM_ACTIONS and action.dtype == jnp.int32
 
 
-def test_random_actions_cover_the_whole_map():
-    actions = np.asarray(jax.vmap(exploration.random_action)(jax.random.split(jax.random.key(1), 20_000)))
+def test_random_actions_cover_the_whole_map_or_what_the_network_values_of_it():
+    everywhere, keys = jnp.ones((100, 100), bool), jax.random.split(jax.random.key(1), 20_000)
+    draw = jax.jit(jax.vmap(exploration.random_action, (0, None)))
+    few = everywhere.at[:, :98].set(False)
+    assert set(np.asarray(draw(keys, few)) % 200) == {196, 197, 198, 199}
+    actions = np.asarray(draw(keys, everywhere))
     assert actions.min() < 20 and actions.max() >= grid.NUM_ACTIONS - 20
     counts, _ = np.histogram(actions, bins=20, range=(0, grid.NUM_ACTIONS))
     assert np.all(np.abs(counts - 1000) < 160)

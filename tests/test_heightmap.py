@@ -9,7 +9,7 @@ from heightmap_oracle import box_cloud, cast_rays, make_instances, random_clouds
 from pregrasp_jax import grid, heightmap
 from pregrasp_jax.heightmap import Camera, HullInstances
 
-CAMERA = Camera(position=jnp.array([0.0, 0.0, 1.0]), rotation=jnp.eye(3), fovy=jnp.deg2rad(30.5))
+CAMERA = Camera(position=jnp.array([0.0, 0.0, 1.0]), rotation=jnp.eye(3), fovy=jnp.deg2rad(42.5))
 orthographic, pinhole, render_pinhole, unproject = map(
     jax.jit, (heightmap.orthographic, heightmap.pinhole, heightmap.render_pinhole, heightmap.unproject)
 )

@@ -101,7 +101,8 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     env = make_env(config, split="test", progress=packed)
     if trained is None:
         return Player(_make_script(request.policy, env, config), None, env, config)
-    q_function = make_q_function(config.network, config.task)
+    # Of the task that it was trained on: a window of another size is another input.
+    q_function = make_q_function(config.network, trained.config.task)
     if not q_function.fits(trained.params):
         raise ValueError(f"policy {trained.origin} does not fit its network in this version of the package")
     return Player(
@@ -164,6 +165,11 @@ def _environment_config(request: EvaluationConfig, trained: Config) -> Config:
         raise ValueError(f"num_envs = {request.num_envs} is out of range; allowed is 1 and more, or 0 to let it choose")
     if request.episodes < 1:
         raise ValueError(f"episodes = {request.episodes} is out of range; allowed is 1 and more")
+    if trained.network.architecture == "compact" and (request.r_out or 0.0) > trained.task.r_out:
+        raise ValueError(
+            f"r_out = {request.r_out} is out of range; allowed for this policy, whose network values no longer pushes, "
+            f"is {trained.task.r_in} to {trained.task.r_out}"
+        )
     test_scenes = max(request.scene.test_scenes, request.episodes)
     config = dataclasses.replace(
         trained,

@@ -83,13 +83,25 @@ def look_around_hand(obs: Observation, target_slot: jax.Array, *, size: WindowSi
     """
     images = network_input(obs, target_slot)
     images = jnp.concatenate([images, jnp.ones_like(images[..., :1])], axis=-1)
-    # Positions of the hand are cell centres, and the start lies on a corner of cells.
-    row, col = grid.world_to_cell(obs.p1 + 0.01 * grid.HEIGHTMAP_RESOLUTION)
-    origin = jnp.stack([row - size.beside, col - size.behind])
+    origin = _window_origin(obs.p1, size)
     rows, cols = size.shape
     padded = jnp.pad(images, ((rows, rows), (cols, cols), (0, 0)))
     start = (origin[0] + rows, origin[1] + cols, jnp.int32(0))
     return Window(jax.lax.dynamic_slice(padded, start, (rows, cols, 3)), origin)
+
+
+def cells_around_hand(p1: jax.Array, *, size: WindowSize) -> jax.Array:
+    """Return the cells [H, W] bool that the network values, mirrored or not, when the hand is at p1 [2]."""
+    rows, cols = size.shape
+    inner = jnp.ones((rows - 2, cols, 1), bool)  # the last row has no value, nor has that of the mirror image
+    return paste(inner, _window_origin(p1, size) + jnp.array([1, 0]))[..., 0]
+
+
+def _window_origin(p1: jax.Array, size: WindowSize) -> jax.Array:
+    """Return row and col [2] int32 of the grid where the window begins."""
+    # Positions of the hand are cell centres, and the start lies on a corner of cells.
+    row, col = grid.world_to_cell(p1 + 0.01 * grid.HEIGHTMAP_RESOLUTION)
+    return jnp.stack([row - size.beside, col - size.behind])
 
 
 def mirror_window(window: Window) -> Window:
@@ -100,9 +112,9 @@ def mirror_window(window: Window) -> Window:
 
 
 def paste(q: jax.Array, origin: jax.Array) -> jax.Array:
-    """Put the values of a window [R, C, 2] at `origin` [2] into the grid: [H, W, 2], 0 outside of the window."""
-    rows, cols = q.shape[:2]
-    blank = jnp.zeros((grid.GRID_SIZE + 2 * rows, grid.GRID_SIZE + 2 * cols, 2), q.dtype)
+    """Put the values of a window [R, C, K] at `origin` [2] into the grid: [H, W, K], 0 outside of the window."""
+    rows, cols, depth = q.shape
+    blank = jnp.zeros((grid.GRID_SIZE + 2 * rows, grid.GRID_SIZE + 2 * cols, depth), q.dtype)
     pasted = jax.lax.dynamic_update_slice(blank, q, (origin[0] + rows, origin[1] + cols, jnp.int32(0)))
     return pasted[rows:-rows, cols:-cols]
 

@@ -12,7 +12,13 @@ import jax.numpy as jnp
 from pregrasp_jax import grid
 from pregrasp_jax.config import NetworkConfig, TaskConfig
 from pregrasp_jax.heightmap import network_input
-from pregrasp_jax.learning.compact import CompactNetwork, look_around_hand, mirror_window, window_size
+from pregrasp_jax.learning.compact import (
+    CompactNetwork,
+    cells_around_hand,
+    look_around_hand,
+    mirror_window,
+    window_size,
+)
 from pregrasp_jax.learning.networks import QNetwork
 from pregrasp_jax.learning.replay import InputFn
 from pregrasp_jax.types import Observation
@@ -21,6 +27,12 @@ Params = Any
 
 _COMPACT_CHANNELS = 128
 """Channels of the compact network at width 1."""
+
+
+def everywhere(p1: jax.Array) -> jax.Array:
+    """Return the whole grid [H, W] bool."""
+    del p1
+    return jnp.ones((grid.GRID_SIZE, grid.GRID_SIZE), bool)
 
 
 @dataclass(frozen=True)
@@ -32,11 +44,13 @@ class QFunction:
         input_fn: (observation, target slot) -> inputs, unbatched.
         mirror_fn: inputs of B scenes -> the same reflected in the robot's plane y = 0. Then a value is the mean of what
             the network says of a scene and of its mirror image; None leaves the network alone.
+        domain_fn: p1 [2] -> [H, W] bool, where a push may end of which the network says anything.
     """
 
     network: nn.Module
     input_fn: InputFn
     mirror_fn: Callable[[Any], Any] | None = None
+    domain_fn: Callable[[jax.Array], jax.Array] = everywhere
 
     def init(self, key: jax.Array) -> Params:
         """Return initial parameters."""
@@ -85,11 +99,12 @@ def make_q_function(network: NetworkConfig, task: TaskConfig) -> QFunction:
     if network.architecture == "paper":
         mirror_fn = mirror_images if network.mirror else None
         return QFunction(QNetwork(width=network.width, initial_bias=network.initial_bias), network_input, mirror_fn)
-    channels = max(1, round(_COMPACT_CHANNELS * network.width))
+    channels, size = max(1, round(_COMPACT_CHANNELS * network.width)), window_size(task)
     return QFunction(
         CompactNetwork(channels=channels, initial_bias=network.initial_bias),
-        functools.partial(look_around_hand, size=window_size(task)),
+        functools.partial(look_around_hand, size=size),
         mirror_window if network.mirror else None,
+        functools.partial(cells_around_hand, size=size),
     )
 
 

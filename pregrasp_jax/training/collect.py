@@ -15,8 +15,9 @@ import jax.numpy as jnp
 from pregrasp_jax import exploration
 from pregrasp_jax.config import ExplorationConfig
 from pregrasp_jax.judge import TARGET_IN_REGION
-from pregrasp_jax.learning.learner import ApplyFn, Params, greedy_action
-from pregrasp_jax.learning.replay import InputFn, Steps
+from pregrasp_jax.learning.learner import Params, greedy_action
+from pregrasp_jax.learning.q_function import QFunction
+from pregrasp_jax.learning.replay import Steps
 from pregrasp_jax.training.mishap import Mishap, no_mishap
 from pregrasp_jax.training.sharding import VmapFn
 from pregrasp_jax.types import REASONS, EnvState, HullBank, StepResult
@@ -141,8 +142,7 @@ def init_actors(key: jax.Array, env: Environment, num_envs: int, *, vmap: VmapFn
 
 def make_collect(
     env: Environment,
-    apply_fn: ApplyFn,
-    input_fn: InputFn,
+    q_function: QFunction,
     config: ExplorationConfig,
     *,
     warmup: int,
@@ -152,8 +152,7 @@ def make_collect(
 
     Args:
         env: the scenes.
-        apply_fn: the network on a batch.
-        input_fn: what the network sees of an observation.
+        q_function: values of pushes.
         config: exploration.
         warmup: env steps of pure exploration.
         vmap: maps pushes and resets over scenes.
@@ -161,7 +160,7 @@ def make_collect(
 
     def explore(key: jax.Array, state: EnvState, mask: jax.Array) -> jax.Array:
         if not config.guided:
-            return exploration.random_action(key)
+            return exploration.random_action(key, q_function.domain_fn(state.p1))
         target_xy = state.centroids[state.scene.target]
         return exploration.guided_action(
             key,
@@ -189,7 +188,7 @@ def make_collect(
         num_envs = states.p1.shape[0]
         key, action_key, reset_key = jax.random.split(actors.key, 3)
         epsilon = epsilon_at(actors.tally.env_steps, config, warmup=warmup)
-        q = apply_fn(params, jax.vmap(input_fn)(states.obs, states.scene.target))
+        q = q_function.apply(params, jax.vmap(q_function.input_fn)(states.obs, states.scene.target))
         keys = jax.random.split(action_key, num_envs)
         actions, random = jax.vmap(act, (0, 0, 0, None))(keys, states, q, epsilon)
         # Scenes first, then the branches: [E (1 + branches)].

@@ -150,9 +150,7 @@ def make_program(
     q = q_function or make_q_function(config.network, config.task)
     optimizer = make_optimizer(config.learner)
     # Under jit, so that shapes, start and compilation share one trace: that of a physics engine takes seconds.
-    collect = jax.jit(
-        make_collect(env, q.apply, q.input_fn, config.exploration, warmup=config.learner.warmup, vmap=layout.vmap)
-    )
+    collect = jax.jit(make_collect(env, q, config.exploration, warmup=config.learner.warmup, vmap=layout.vmap))
 
     def init(key: jax.Array) -> TrainState:
         network_key, actor_key, learner_key = jax.random.split(key, 3)
