@@ -59,7 +59,7 @@ def main() -> None:
 
     def attempt(scene: SceneParams) -> jax.Array:
         state: EnvState = env.start(scene)
-        return env.grasp(state)
+        return env.grasp(state).held
 
     held = np.asarray(jax.jit(jax.vmap(attempt))(jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)))
     held = held.reshape(len(objects), NUM_YAWS)

@@ -171,9 +171,9 @@ class TrainConfig:
     """Env steps between rows of metrics.jsonl."""
     tensorboard: bool = False
     """Write the same numbers for TensorBoard, into the run folder (needs the extra `tensorboard`)."""
-    fused_iterations: int = 0
-    """Pushes of every scene, with their updates, in one compiled program without the host (engine `mjx` on
-    accelerators); everything else happens between two of these. 0 leaves every step to the host."""
+    fused_iterations: int | None = None
+    """Pushes of every scene, with their updates, in one compiled program without the host; everything else happens
+    between two of these. 0 leaves every step to the host; None chooses: 4 for `mjx` on accelerators, else 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,7 +200,7 @@ class Config:
         """
         for key, (low, high) in _RANGES.items():
             value = operator.attrgetter(key)(self)
-            if not low <= value <= high:
+            if value is not None and not low <= value <= high:
                 raise ValueError(f"{key} = {value} is out of range; allowed is {low} to {high}")
         if self.task.r_in >= self.task.r_out:
             raise ValueError(f"task.r_in = {self.task.r_in} must be below task.r_out = {self.task.r_out}")

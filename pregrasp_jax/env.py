@@ -28,6 +28,7 @@ from pregrasp_jax.types import (
     OPEN,
     REASONS,
     EnvState,
+    GraspResult,
     HullBank,
     Observation,
     Outcome,
@@ -142,11 +143,8 @@ class Env:
         """Return the cells [H, W] bool in which the next push may end."""
         return primitives.half_ring_mask(p1, r_in=self.task.r_in, r_out=self.task.r_out, full_ring=self.task.full_ring)
 
-    def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> jax.Array:
-        """Close with constant force, lift 0.2 m, hold 5 s; return whether the target stayed between the fingers.
-
-        Without `execute` () bool it did not, at no cost.
-        """
+    def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> GraspResult:
+        """Close with constant force, lift 0.2 m, hold 5 s. Without `execute` () bool nothing is held, at no cost."""
         times = CTRL_DT * jnp.arange(round((CLOSE_TIME + LIFT_HEIGHT / LIFT_SPEED + HOLD_TIME) / CTRL_DT))
         lift = LIFT_HEIGHT * primitives.minimum_jerk((times - CLOSE_TIME) / (LIFT_HEIGHT / LIFT_SPEED))
         xy = jnp.broadcast_to(state.p1, (len(times), 2))
@@ -159,7 +157,7 @@ class Env:
         target = state.scene.target
         rise = after.object_poses[target, 2] - state.physics_obs.object_poses[target, 2]
         held = self._coverage(after, state.scene, jnp.int32(OPEN))[target] > 0
-        return (rise > _MIN_LIFT) & held & ~after.diverged
+        return GraspResult((rise > _MIN_LIFT) & held & ~after.diverged, after.diverged, after.overflows)
 
     def start(self, scene: SceneParams, index: jax.Array | int = -1) -> EnvState:
         """Return any scene with the open hand at the start; `index` is its row of the bank, -1 for none."""

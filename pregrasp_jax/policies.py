@@ -189,7 +189,7 @@ def _first_grasp(env: Env, states: EnvState, enclosed: jax.Array) -> jax.Array:
         waiting, held = carry
         index = jnp.argmax(waiting)
         state = jax.tree.map(lambda leaf: leaf[index], states)
-        return waiting.at[index].set(False), held.at[index].set(env.grasp(state, execute=untried(carry)))
+        return waiting.at[index].set(False), held.at[index].set(env.grasp(state, execute=untried(carry)).held)
 
     return jax.lax.while_loop(untried, grasp, (enclosed, jnp.zeros_like(enclosed)))[1]
 

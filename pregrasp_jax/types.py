@@ -166,6 +166,20 @@ class Outcome(struct.PyTreeNode):
     diverged: jax.Array
 
 
+class GraspResult(struct.PyTreeNode):
+    """What a grasp did.
+
+    Attributes:
+        held: () bool, the target was lifted and stayed between the fingers.
+        diverged: () bool, as in `PhysicsObservation`.
+        overflows: () int32, as in `PhysicsObservation`, the pushes before the grasp included.
+    """
+
+    held: jax.Array
+    diverged: jax.Array
+    overflows: jax.Array
+
+
 class EnvState(struct.PyTreeNode):
     """State of one scene between pushes.
 

@@ -20,6 +20,7 @@ from pregrasp_jax.types import (
     OPEN,
     REASONS,
     EnvState,
+    GraspResult,
     Observation,
     Outcome,
     PhysicsObservation,
@@ -111,8 +112,8 @@ class FakeEnv:
         next_state = state.replace(p1=p1, aperture=aperture, num_pushes=num_pushes)
         return next_state, StepResult(outcome, reward, terminated, truncated, reason)
 
-    def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> jax.Array:
-        return (state.scene_index % 2 == 0) & execute
+    def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> GraspResult:
+        return GraspResult((state.scene_index % 2 == 0) & execute, jnp.bool_(False), jnp.int32(0))
 
 
 def fake_env(**fields: Any) -> Any:

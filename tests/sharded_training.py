@@ -98,7 +98,7 @@ def main() -> None:
     fakes: dict[str, Any] = {
         "make_env": lambda config, **options: CountedEnv(),
         "make_program": lambda env, config, **options: fake_training.make_program(config, env, **options),
-        "make_evaluate": lambda env, config: fake_training.evaluate,
+        "make_evaluate": lambda env, config: (fake_training.evaluate, lambda params: None),
         "Trainer": WatchedTrainer,
     }
     for name, fake in fakes.items():

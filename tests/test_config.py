@@ -27,7 +27,7 @@ def test_every_number_has_a_range():
         for stage, cls in hints.items()
         if dataclasses.is_dataclass(cls)
         for name, hint in typing.get_type_hints(cls).items()
-        if hint in (int, float)
+        if hint in (int, float, int | None)
     }
     assert numeric == set(config_module._RANGES)
 
@@ -39,7 +39,7 @@ def test_a_value_beyond_its_range_is_refused(key):
     for value in (low - 1, high + 1):
         values = to_dict(Config())
         section = values[stage[0]] if stage else values
-        section[name] = type(section[name])(value)
+        section[name] = value if section[name] is None else type(section[name])(value)
         with pytest.raises(ValueError, match=rf"^{key} = .* is out of range; allowed is ") as error:
             from_dict(values).validate()
         assert "\n" not in str(error.value)

@@ -268,7 +268,11 @@ def test_grasp_holds_the_target_between_the_fingers_and_nothing_else(env, pushes
     states[list(CASES).index("too long, and below the table")] = thrown.replace(physics=physics)
     before = stack(states)
     grasp = jax.vmap(lambda state, execute: env.grasp(state, execute=execute))
-    held = unstack(jax.jit(grasp)(before, executed(CASES)), CASES)
+    results = jax.jit(grasp)(before, executed(CASES))
+    dropped = {name for name, case in CASES.items() if 4.0 in (case.target[1][2], case.obstacle[1][2])}  # they hit hard
+    diverged = {name for name, did in unstack(results.diverged, CASES).items() if did}
+    assert {"nan"} <= diverged <= {"nan"} | dropped
+    held = unstack(results.held, CASES)
     del held["target between the fingers after the push"]  # at the tips, where a round can is held by luck
     expected = {name: CASES[name].target == CAN_AT_PALM and CASES[name].execute for name in held}
     assert held == expected and sum(expected.values()) == 2

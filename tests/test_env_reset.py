@@ -1,12 +1,15 @@
 """How the environment begins: resets, fixed scenes, and settings that cannot work."""
 
 import dataclasses
+from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from jax.extend.core import jaxprs_in_params
 from test_env import START, unstack
 
 from pregrasp_jax import env as env_module
@@ -89,6 +92,25 @@ def test_a_started_scene_shows_every_object_to_an_open_hand_at_the_start(env):
 def test_pushes_are_planned_as_long_as_exploration_needs_them(guided, longest):
     config = Config(scene=SceneConfig(test_scenes=3), exploration=ExplorationConfig(guided=guided))
     assert longest <= make_env(config, split="test").max_distance < longest + 0.2
+
+
+def test_nothing_that_is_measured_is_multiplied_in_less_than_float32(env):
+    """Accelerators do so by default; it moves a point by tenths of a millimetre. The CPU would not show it."""
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    programs = [jax.make_jaxpr(env.reset)(jax.random.key(0)), jax.make_jaxpr(env.step)(state, jnp.int32(0))]
+    programs.append(jax.make_jaxpr(env.grasp)(state))
+    products = [eqn for program in programs for eqn in equations(program.jaxpr) if eqn.primitive.name == "dot_general"]
+    assert len(products) > 5
+    for product in products:
+        assert product.params["precision"] == (jax.lax.Precision.HIGHEST,) * 2, product.source_info
+
+
+def equations(jaxpr: Any) -> Iterator[Any]:
+    """Yield the equations of a program, of those that it calls too."""
+    for eqn in jaxpr.eqns:
+        yield eqn
+        for inner in jaxprs_in_params(eqn.params):
+            yield from equations(inner)
 
 
 def test_settings_that_cannot_work_are_refused(monkeypatch):

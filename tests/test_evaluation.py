@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fake_env import fake_env, make_scenes
+from fake_env import FakeEnv, fake_env, make_scenes
 from jax.tree_util import Partial
 
 from pregrasp_jax import grid, policies
 from pregrasp_jax.config import Config, SceneConfig, TaskConfig
 from pregrasp_jax.env import make_env
 from pregrasp_jax.evaluation import Episode, EvaluationResult, Evaluator, evaluate_policy, results
-from pregrasp_jax.types import OPEN, REASONS, EnvState, Observation
+from pregrasp_jax.types import OPEN, REASONS, EnvState, GraspResult, Observation
 
 ENV = fake_env()
 
@@ -38,11 +39,29 @@ def _reference(env: Any, policy: policies.Policy, episodes: int, seed: int, with
             if result.terminated or result.truncated:
                 break
         reason = REASONS[int(result.reason)]
-        if reason == "target_in_region" and with_grasp and not env.grasp(state):
+        if reason == "target_in_region" and with_grasp and not env.grasp(state).held:
             reason = "grasp_failed"
         name = env.bank.names[env.scenes.object_ids[scene, env.scenes.target[scene]]]
         rows.append(Episode(scene=scene, target=name, reason=reason, motions=motions, return_=total, seconds=seconds))
     return rows
+
+
+@dataclass(frozen=True)
+class _Shaky(FakeEnv):
+    """Grasps of odd scenes make no sense afterwards; in scene 2 contacts are dropped, and it holds."""
+
+    def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> GraspResult:
+        odd = state.scene_index % 2 == 1
+        return GraspResult(~odd & execute, odd, jnp.where(state.scene_index == 2, 7, 0))
+
+
+def test_what_happens_during_a_grasp_is_not_silent() -> None:
+    env: Any = _Shaky()
+    result = evaluate_policy(env, policies.SCRIPTS["straight"](ENV), episodes=12, num_envs=5)
+    grasped = [e for e in result.episodes if e.reason in ("target_in_region", "nan")]
+    assert {e.reason for e in grasped if e.scene % 2} == {"nan"}
+    assert {e.reason for e in grasped if not e.scene % 2} == {"target_in_region"}
+    assert [e.scene for e in result.episodes if e.overflows] == [2] and result.summary()["overflows"] == 1
 
 
 def _assert_equal(result: EvaluationResult, expected: list[Episode]) -> None:

@@ -12,7 +12,7 @@ from fake_env import UNREACHABLE_ROWS, FakeEnv, fake_env, make_scenes
 from pregrasp_jax import grid, policies
 from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.judge import TARGET_IN_REGION
-from pregrasp_jax.types import CLOSED, OPEN, REASONS, EnvState, Observation
+from pregrasp_jax.types import CLOSED, OPEN, REASONS, EnvState, GraspResult, Observation
 
 ENV = fake_env()
 
@@ -179,8 +179,8 @@ def test_lookahead_ranks_success_then_distance_then_failure() -> None:
 class _Slippery(FakeEnv):
     """Only an episode's second push leaves the target where it can be held."""
 
-    def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> jax.Array:
-        return (state.num_pushes == 2) & execute
+    def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> GraspResult:
+        return GraspResult((state.num_pushes == 2) & execute, jnp.bool_(False), jnp.int32(0))
 
 
 def test_lookahead_prefers_a_candidate_whose_grasp_holds(key: jax.Array) -> None:
@@ -192,7 +192,7 @@ def test_lookahead_prefers_a_candidate_whose_grasp_holds(key: jax.Array) -> None
     lookahead = jax.jit(policies.make_lookahead(env))
     state, _ = env.step(state, lookahead(state, key))
     state, result = env.step(state, lookahead(state, key))
-    assert int(result.reason) == TARGET_IN_REGION and env.grasp(state)
+    assert int(result.reason) == TARGET_IN_REGION and env.grasp(state).held
 
 
 def test_lookahead_tries_grasps_until_one_holds() -> None:

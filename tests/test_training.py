@@ -1,6 +1,8 @@
 """The training loop on a world without physics: bookkeeping, determinism, resume; for faults see tests/faults."""
 
 import dataclasses
+import io
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -171,6 +173,40 @@ def test_a_run_that_died_in_its_last_evaluation_has_it_when_it_is_resumed(tmp_pa
     assert not (path / "best").exists()
     run(path, config, resume=True)
     assert load_policy(path).evaluation["success_rate"] == 0.25
+
+
+def test_compiling_the_evaluation_is_announced_measured_and_no_training_time(tmp_path):
+    said = io.StringIO()
+    trainer = make_trainer(tmp_path / "run", make_config(episodes=6), said=said)
+
+    def compile_evaluation(params: Any) -> None:
+        assert trainer.progress.env_steps == 0 and said.getvalue() == "compiling ...\n"
+        assert checksum(params) == checksum(trainer.state.learning.learner.target_params)
+        time.sleep(2.0)
+
+    trainer.compile_evaluation = compile_evaluation
+    start = time.perf_counter()
+    with trainer.folder:
+        trainer.run(never)
+    assert trainer.progress.total_seconds < time.perf_counter() - start - 2.0
+    assert all(row["time/compile"] > 2.0 for row in rows(tmp_path / "run") if "train/loss" in row)
+
+
+@pytest.mark.parametrize(
+    ("engine", "backend", "asked", "fused"),
+    [
+        ("mjx", "gpu", None, 4),
+        ("mjx", "cpu", None, 0),
+        ("native", "gpu", None, 0),
+        ("mjx", "gpu", 0, 0),
+        ("mjx", "cpu", 3, 3),
+    ],
+)
+def test_one_program_of_several_iterations_where_it_pays(monkeypatch, engine, backend, asked, fused):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    config = make_config(fused_iterations=asked)
+    config = dataclasses.replace(config, physics=dataclasses.replace(config.physics, engine=engine))
+    assert make_program(config).fused_iterations == fused
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):

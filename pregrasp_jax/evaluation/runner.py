@@ -18,7 +18,7 @@ from pregrasp_jax.evaluation.results import GRASP_FAILED, Episode, EvaluationRes
 from pregrasp_jax.judge import RUNNING, TARGET_IN_REGION
 from pregrasp_jax.policies import Policy
 from pregrasp_jax.primitives import APERTURE_TIME, SETTLE_TIME
-from pregrasp_jax.types import REASONS, EnvState
+from pregrasp_jax.types import REASONS, EnvState, GraspResult
 
 Progress = Callable[[int, int, int], None]
 """(episodes ended, episodes in all, successes so far) -> None."""
@@ -159,19 +159,23 @@ class Evaluator:
             return []
         padded = runs + runs[-1:] * (self._num_envs - len(runs))
         states = jax.tree.map(lambda *leaves: np.stack(leaves), *(run.state for run in padded))
-        held = self._call(self._grasp, states)
-        return [self._episode(run, held=bool(ok)) for run, ok in zip(runs, np.asarray(held), strict=False)]
+        grasps = jax.device_get(self._call(self._grasp, states))
+        return [self._episode(run, jax.tree.map(lambda leaf, i=i: leaf[i], grasps)) for i, run in enumerate(runs)]
 
-    def _episode(self, run: _Run, *, held: bool = True) -> Episode:
-        scene = run.state.scene
+    def _episode(self, run: _Run, grasp: GraspResult | None = None) -> Episode:
+        scene, reason, overflows = run.state.scene, REASONS[int(run.reason)], run.state.physics_obs.overflows
+        if grasp is not None:
+            if not grasp.held:
+                reason = "nan" if grasp.diverged else GRASP_FAILED
+            overflows = grasp.overflows
         return Episode(
             scene=int(run.state.scene_index),
             target=self._env.bank.names[int(scene.object_ids[scene.target])],
-            reason=REASONS[int(run.reason)] if held else GRASP_FAILED,
+            reason=reason,
             motions=int(run.state.num_pushes),
             return_=float(run.return_),
             seconds=float(run.seconds),
-            overflows=int(run.state.physics_obs.overflows),
+            overflows=int(overflows),
         )
 
     def _start_one(self, index: jax.Array) -> _Run:

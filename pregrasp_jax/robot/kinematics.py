@@ -86,7 +86,7 @@ def _solve_branch(base_from_flange: jax.Array, signs: jax.Array) -> jax.Array:
     c1, s1 = jnp.cos(q1), jnp.sin(q1)
     normal = jnp.stack([s1, -c1, jnp.zeros_like(c1)])
 
-    nx, ny, nz = jnp.dot(normal, x6), jnp.dot(normal, y6), jnp.dot(normal, z6)
+    nx, ny, nz = _dot(normal, x6), _dot(normal, y6), _dot(normal, z6)
     sine5 = jnp.sqrt(nx**2 + ny**2)
     q5 = jnp.atan2(wrist * sine5, nz)
     free = _free_wrist_turn(base_from_flange, c1 * p5[0] + s1 * p5[1], p5[2] - d[0], jnp.stack([c1, s1]))
@@ -116,7 +116,12 @@ def _free_wrist_turn(base_from_flange: jax.Array, u: jax.Array, v: jax.Array, he
     a, *_ = _constants()
     sign = jnp.where(jnp.hypot(u, v) >= np.abs(a[1]), 1.0, -1.0)
     outward = sign * jnp.stack([u * heading[0], u * heading[1], v])
-    return jnp.atan2(-jnp.dot(outward, base_from_flange[:3, 0]), -jnp.dot(outward, base_from_flange[:3, 1]))
+    return jnp.atan2(-_dot(outward, base_from_flange[:3, 0]), -_dot(outward, base_from_flange[:3, 1]))
+
+
+def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return a . b in full float32, where `jnp.dot` is what an accelerator does by default."""
+    return jnp.sum(a * b)
 
 
 def _wrap(angle: jax.Array) -> jax.Array:

@@ -65,6 +65,10 @@ IterateFn = Callable[[TrainState, Any, Any], TrainState]
 """``(state, updates [K] int32, beta [K] float32) -> state`` after K iterations, with so many updates in each."""
 
 
+FUSED_ITERATIONS = 4
+"""What `TrainConfig.fused_iterations` chooses: few, since signals, logs and limits wait for the end of a program."""
+
+
 @dataclass(frozen=True)
 class Program:
     """What a training runs.
@@ -186,7 +190,14 @@ def make_program(
             f"{config.network.architecture} and network.width = {config.network.width}"
         )
     remember = make_remember(config.replay, config.task)
-    return Program(init, collect, remember, update, config.train.fused_iterations, layout=layout)
+    return Program(init, collect, remember, update, _num_fused(config), layout=layout)
+
+
+def _num_fused(config: Config) -> int:
+    """Return how many iterations one program is; 0 leaves every step to the host."""
+    if config.train.fused_iterations is not None:
+        return config.train.fused_iterations
+    return FUSED_ITERATIONS if config.physics.engine == "mjx" and jax.default_backend() != "cpu" else 0
 
 
 def make_iterate(program: Program) -> IterateFn:

@@ -21,7 +21,7 @@ from pregrasp_jax.training.interrupt import Interrupt
 from pregrasp_jax.training.program import enable_compilation_cache, make_program
 from pregrasp_jax.training.run_folder import RunFolder, WatchedFolder, refuse_used
 from pregrasp_jax.training.sharding import make_layout
-from pregrasp_jax.training.trainer import EvaluateFn, Trainer
+from pregrasp_jax.training.trainer import CompileFn, EvaluateFn, Trainer
 
 VALIDATION_ENVS = 16
 """Validation scenes side by side; the result does not depend on it."""
@@ -77,7 +77,9 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
     hashes = _hashes(env, validation)
     processes.refuse_difference(io.content_hash(to_dict(config), hashes))
     resumed, folder = folder is not None, folder or _create(run_dir, config)
-    trainer = Trainer(config, folder, program, make_evaluate(validation, config), make_dump(env, config), console)
+    evaluate, compile_evaluation = make_evaluate(validation, config)
+    dump = make_dump(env, config)
+    trainer = Trainer(config, folder, program, evaluate, dump, console, compile_evaluation=compile_evaluation)
     with folder, Interrupt(console.say, console.close) as interrupt:
         folder.begin_session(config, hashes)
         (trainer.resume if processes.agreed(resumed and folder.has_checkpoint) else trainer.begin)()
@@ -89,8 +91,8 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
         return interrupt.exit_code or (0 if trainer.saved else 1)
 
 
-def make_evaluate(env: Env, config: Config) -> EvaluateFn:
-    """Return the function that measures parameters on all scenes of `env`, grasp included; it compiles once."""
+def make_evaluate(env: Env, config: Config) -> tuple[EvaluateFn, CompileFn]:
+    """Return the function that measures parameters on all scenes of `env`, grasp included, and what compiles it."""
     make_policy = policies.make_learned(env, make_q_function(config.network, config.task).values)
     episodes = len(env.scenes)
     evaluator = Evaluator(env, num_envs=min(VALIDATION_ENVS, episodes))
@@ -98,7 +100,10 @@ def make_evaluate(env: Env, config: Config) -> EvaluateFn:
     def evaluate(params: Params) -> dict[str, Any]:
         return evaluator.run(make_policy(params), episodes=episodes, seed=config.seed).summary()
 
-    return evaluate
+    def compile_evaluation(params: Params) -> None:
+        evaluator.compile(make_policy(params), episodes=episodes)
+
+    return evaluate, compile_evaluation
 
 
 def _console() -> Console:

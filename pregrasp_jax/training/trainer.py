@@ -26,6 +26,9 @@ from pregrasp_jax.training.run_folder import RunFolder
 EvaluateFn = Callable[[Params], dict[str, Any]]
 """``params -> {"success_rate": ..., ...}`` on the validation scenes."""
 
+CompileFn = Callable[[Params], None]
+"""Compiles an `EvaluateFn` for parameters like these."""
+
 PHASES = ("collect", "learn", "evaluate", "checkpoint")
 
 
@@ -78,6 +81,8 @@ class Trainer:
         evaluate: EvaluateFn,
         dump: DumpFn,
         console: Console,
+        *,
+        compile_evaluation: CompileFn = lambda params: None,
     ):
         """Compile nothing yet.
 
@@ -88,11 +93,13 @@ class Trainer:
             evaluate: measures parameters on the validation scenes.
             dump: writes down a push that the physics did not survive.
             console: told about progress.
+            compile_evaluation: called before the training, so that none of its time is compilation.
         """
         self.config = config
         self.folder = folder
         self.program = program
         self.evaluate_fn = evaluate
+        self.compile_evaluation = compile_evaluation
         self.dump_fn = dump
         self.console = console
         self.progress = Progress()
@@ -100,6 +107,7 @@ class Trainer:
         self._unsaved = True
         self._tried_to_save_at = 0.0
         self._logged_at = (0, 0.0)
+        self._compiled_in = 0.0
 
     def begin(self) -> None:
         """Start from the seed, and write the checkpoint of step 0.
@@ -157,7 +165,10 @@ class Trainer:
         if progress.share_done(self.config) >= 1.0 and progress.evaluated_at == progress.env_steps:
             return "the run is complete; a higher --train.episodes or --train.minutes extends it"
         with announced_compilation(self.console.say):
-            program, _ = self.program.compile(self.state)
+            program, seconds = self.program.compile(self.state)
+            start = time.perf_counter()
+            self.compile_evaluation(self._average())
+            self._compiled_in = seconds + time.perf_counter() - start
         self.console.start()
         while processes.agreed(progress.share_done(self.config) < 1.0):
             if processes.agreed(stop()):
@@ -213,7 +224,7 @@ class Trainer:
     @property
     def _iterations(self) -> int:
         """How many pushes of every scene a step is."""
-        return max(1, self.config.train.fused_iterations)
+        return max(1, self.program.fused_iterations)
 
     def _beta(self, env_steps: int) -> float:
         """Return the importance exponent."""
@@ -233,6 +244,7 @@ class Trainer:
         steps, seconds = progress.env_steps - self._logged_at[0], progress.total_seconds - self._logged_at[1]
         row |= {"train/epsilon": float(epsilon), "time/seconds": progress.total_seconds}
         row |= {f"time/{phase}": progress.seconds[phase] for phase in PHASES}
+        row["time/compile"] = self._compiled_in
         row["time/env_steps_per_second"] = steps / max(seconds, 1e-9)
         self.dump()
         self._refuse_non_finite()
@@ -272,8 +284,7 @@ class Trainer:
         if progress.evaluated_at == progress.env_steps:
             return
         progress.evaluated_at = progress.env_steps
-        # The average is the better policy: it jumps less. One device evaluates, in every process the same.
-        params = self.program.layout.one_copy(self.state.learning.learner.target_params)
+        params = self._average()
         with progress.timed("evaluate"):
             measured = self.evaluate_fn(params)
         self._unsaved = True  # the best score is part of a checkpoint
@@ -289,6 +300,11 @@ class Trainer:
                 progress.best = measured["success_rate"]
         best = "none kept" if progress.best is None else f"best {progress.best:.0%}"
         self.console.say(f"validation at step {progress.env_steps}: success {measured['success_rate']:.0%} ({best})")
+
+    def _average(self) -> Params:
+        """Return the parameters that are measured and kept: the average is the better policy, it jumps less."""
+        # One device evaluates, in every process the same.
+        return self.program.layout.one_copy(self.state.learning.learner.target_params)
 
     def save(self) -> None:
         """Write a checkpoint, unless this step has one."""
