@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 from fake_env import fake_env
-from report_files import ROWS, write_evaluation, write_run
+from report_files import ROWS, evaluation_row, write_evaluation, write_run
 
 from pregrasp_jax import __main__ as main_module
 from pregrasp_jax.checkpoint import save_policy
@@ -102,6 +102,15 @@ def test_curves_against_steps_and_time(run_dir: Path) -> None:
     ]
 
 
+def test_an_interval_stays_with_its_row_where_another_row_has_no_time(tmp_path: Path) -> None:
+    rows = [evaluation_row(100, 10.0, 0.5, [0.25, 0.75]), evaluation_row(200, 40.0, 0.5, [0.0, 1.0])]
+    del rows[0]["time/seconds"]
+    pushes, time = learning_figures(read_run(write_run(tmp_path / "mixed", rows)))
+    assert pushes.count('class="error s0"') == 2 and time.count('class="error s0"') == 1
+    # 0 to 100 % is the whole height of the plotting area.
+    assert 'y1="212" x2="426" y2="12" class="error s0"' in time
+
+
 def test_failures_and_times_are_counted(run_dir: Path) -> None:
     file = write_evaluation(run_dir / "a.json", "first", [1, 1, 1, 0])
     run = read_run(run_dir)
@@ -142,6 +151,9 @@ def test_a_line_that_a_crash_cut_is_left_out(run_dir: Path) -> None:
         ("metrics.jsonl", '{"env_steps": 1}\n{"env\n{"env_steps": 2}\n', "metrics.jsonl: line 2 is damaged, not JSON"),
         ("metrics.jsonl", '{"env_steps": "many"}\n', "metrics.jsonl: line 1 is damaged, it has no env_steps"),
         ("best/evaluation.json", "", "evaluation.json: damaged, not JSON"),
+        ("best/evaluation.json", '{"success_rate": 1, "success_ci95": 7}', "evaluation.json: damaged (success_ci95)"),
+        ("best/evaluation.json", '{"success_ci95": [0.5, "x"]}', "evaluation.json: damaged (success_ci95)"),
+        ("best/evaluation.json", '{"success_rate": "all"}', "evaluation.json: damaged (success_rate)"),
         ("evaluations/x.json", "{}", "x.json: not an evaluation; wanted a file written by evaluate.py --json"),
         ("evaluations/x.json", '{"format": "pregrasp_jax evaluation 1"}', "x.json: damaged evaluation (policy, object"),
     ],

@@ -89,8 +89,8 @@ def _header(run: RunRecord) -> Iterator[Markup]:
     yield element("p", f"{text} Written {written}.", class_="soft")
     facts = []
     if is_number(run.best.get("success_rate")):
-        interval = run.best.get("success_ci95") or []
-        between = "95 % interval {} to {}".format(*map(results.percent, interval)) if len(interval) == 2 else ""
+        interval = run.best.get("success_ci95")
+        between = "95 % interval {} to {}".format(*map(results.percent, interval)) if interval else ""
         facts.append(("best validation success", results.percent(run.best["success_rate"]), between))
         if is_number(run.best.get("env_steps")):
             facts.append(("reached after", f"{run.best['env_steps']:,} pushes", ""))
