@@ -13,7 +13,7 @@ import pytest
 from report_files import HOSTILE, ROWS, log_row, make_films, write_evaluation, write_run
 
 from pregrasp_jax.config import PRESETS, to_dict
-from pregrasp_jax.report import build_page, load_evaluations, read_run, write_report
+from pregrasp_jax.report import load_evaluations, read_run, write_report
 from pregrasp_jax.report.films import data_uri
 
 
@@ -93,7 +93,7 @@ def test_no_name_or_setting_gets_into_the_page_as_markup(tmp_path: Path) -> None
         file = run_dir / "evaluations" / f"{len(policy)}.json"
         write_evaluation(file, policy, [0, 1], object_set=HOSTILE, camera=HOSTILE, failures={HOSTILE: 1})
     run = read_run(run_dir)
-    page = build_page(run, load_evaluations(run), make_films(), films_note=HOSTILE)
+    page = write_report(run, load_evaluations(run), make_films(), films_note=HOSTILE).read_text()
     assert "<script" not in page and page.count("&lt;script&gt;") > 10
     assert _Page.of(page).open == []
 
