@@ -1,5 +1,6 @@
 """The command `report`, what a training session leaves behind, and the demo: films of policies in the fake world."""
 
+import json
 import os
 import re
 import sys
@@ -15,6 +16,7 @@ from scripts import load_script
 
 from pregrasp_jax import __main__ as main_module
 from pregrasp_jax.checkpoint import save_policy
+from pregrasp_jax.cli import demo as demo_module
 from pregrasp_jax.cli import player
 from pregrasp_jax.cli import report as report_module
 from pregrasp_jax.cli.report import report, report_session
@@ -194,3 +196,28 @@ def test_ctrl_c_in_the_report_is_said_to_be_there(run_dir: Path, session: Any, m
     error = capsys.readouterr().err.splitlines()[-1]
     assert error.startswith("interrupted while the report was written; the training is saved") and str(run_dir) in error
     assert (run_dir / "report.html").exists()
+
+
+def test_the_demo_leaves_its_evaluations_and_a_report_with_films(
+    run_dir: Path, drawn: list, monkeypatch, capsys
+) -> None:
+    _save_policy(run_dir)
+    monkeypatch.setattr(demo_module, "resume", lambda *_: 0)
+    # The shipped policy and the other scripts would only compile for longer.
+    monkeypatch.setattr(demo_module, "_SCRIPTS", ("clear",))
+    monkeypatch.setattr(demo_module, "_SHIPPED", "random")
+    monkeypatch.setattr(demo_module, "film_episodes", lambda *_, **__: None)
+    demo_module.demo(run_dir=run_dir, episodes=4)
+    files = {file.stem: json.loads(file.read_text()) for file in (run_dir / "evaluations").glob("*.json")}
+    assert sorted(files) == ["seen-clear", "seen-random", "seen-run"]
+    assert files["seen-run"]["policy"] == str(run_dir) and files["seen-clear"]["policy"] == "clear"
+    page = (run_dir / "report.html").read_text()
+    successes = round(4 * files["seen-run"]["success_rate"])
+    assert f"played test scenes 0 to 3 of the seen objects, {successes} with success" in page
+    assert page.count("<article>") == min(3, successes) + min(3, 4 - successes) and "Outdated" not in page
+    assert all(f'scope="row">{name}</th>' in page for name in ("random", "clear"))
+    assert "Missing</strong>: straight on seen objects, lookahead on seen objects." in page
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        f"wrote {run_dir}/report.html: results, learning curves and episodes of the run",
+        f"wrote {run_dir}/demo.gif: random at work",
+    ]
