@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 from fake_env import fake_env
-from report_files import evaluation_row, write_evaluation, write_run
+from report_files import evaluation_row, make_films, write_evaluation, write_run
 from scripts import load_script
 
 from pregrasp_jax import __main__ as main_module
@@ -94,6 +94,19 @@ def test_films_stay_as_long_as_the_policy(run_dir: Path, drawn: list[Any]) -> No
     _save_policy(run_dir, seed=1)
     report(run_dir, films=0)
     assert "<article" not in page.read_text() and "No episodes of this policy were played" in page.read_text()
+
+
+def test_films_belong_to_the_policy_that_was_played(run_dir: Path, drawn: list[Any], monkeypatch) -> None:
+    def film(*_: Any, **__: Any) -> Any:
+        _save_policy(run_dir, seed=1)  # a training that goes on finds a better one meanwhile
+        return make_films(), "Two of them."
+
+    _save_policy(run_dir)
+    monkeypatch.setattr(report_module, "film_run", film)
+    report(run_dir)
+    assert "Two of them." in (run_dir / "report.html").read_text()
+    report(run_dir, films=0)
+    assert "Two of them." not in (run_dir / "report.html").read_text()
 
 
 def test_a_run_with_the_name_of_a_script_plays_its_own_policy(run_dir: Path, drawn: list[Any], monkeypatch) -> None:

@@ -44,8 +44,7 @@ def report(
     Args:
         run_dir: run folder of train.py; it may still be in training.
         evaluations: files written by `evaluate.py --json`; those in RUN_DIR/evaluations if left out.
-        films: successes and failures to show, so many of each; 0 plays nothing and keeps those that the page shows, if
-            the policy is the same.
+        films: successes and failures to show, so many of each; 0 keeps those that the page has of the same policy.
         scenes: test scenes to play at the most while looking for them.
         html: where the page goes; report.html in the run folder if left out.
     """
@@ -55,8 +54,9 @@ def report(
     run = read_run(run_dir)
     load_evaluations(run, evaluations)
     refuse_unwritable(html or run_dir / REPORT)
+    policy = find_policy(run) if films else None
     shown, note = film_run(run, films=films, scenes=scenes) if films else ([], "")
-    path = write_page(run, shown, note, evaluations=evaluations, html=html)
+    path = write_page(run, shown, note, policy=policy, evaluations=evaluations, html=html)
     print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
 
 
@@ -77,9 +77,10 @@ def report_session(run_dir: Path, *, finished: bool, say: Say = lambda line: pri
         if not finished or (run.last(SECONDS) or 0.0) < WORTH_FILMS:
             return
         wanted = f"{path} shows no episodes"
-        if not kept_episodes(path, checksum(find_policy(run).params)):
+        policy = find_policy(run)
+        if not kept_episodes(path, checksum(policy.params)):
             say("playing test scenes for the report, which takes a minute or two")
-            write_page(run, *film_run(run, films=FILMS, scenes=MOST_SCENES, say=say))
+            write_page(run, *film_run(run, films=FILMS, scenes=MOST_SCENES, say=say), policy=policy)
             say(f"wrote {path}")
     except Exception as error:  # whatever it is, the run itself is complete
         say(f"warning: {wanted} ({error})")
@@ -90,14 +91,24 @@ def write_page(
     films: Sequence[Film] = (),
     note: str = "",
     *,
+    policy: Policy | None = None,
     evaluations: Sequence[Path] = (),
     html: Path | None = None,
 ) -> Path:
-    """Write the page with what the run folder holds; the rest is as in `report.write_report` and `report`."""
+    """Write the page with what the run folder holds; the rest is as in `report.write_report` and `report`.
+
+    Args:
+        run: see `read_run`.
+        films: episodes of its policy.
+        note: how they were found.
+        policy: that was filmed, since a training may have saved a better one meanwhile; that of the run if None.
+        evaluations: files; those in the run folder if empty.
+        html: where the page goes; the run folder if None.
+    """
     files = evaluations or sorted((run.path / EVALUATIONS).glob("*.json"))
     documents = load_evaluations(run, files)
     try:
-        policy = find_policy(run)
+        policy = policy or find_policy(run)
     except ValueError:
         return write_report(run, documents, films, films_note=note, path=html)
     saved = policy.origin.stat().st_mtime
@@ -137,11 +148,7 @@ def film_run(run: RunRecord, *, films: int, scenes: int, say: Say = print) -> tu
 
     Returns:
         Episodes, successes first, and one sentence that says how they were found.
-
-    Raises:
-        ValueError: the run has no policy that can be loaded.
     """
-    find_policy(run)
     enable_compilation_cache()
     assets = AssetsConfig(
         object_dir=run.setting("assets", "object_dir", None), object_set=run.setting("assets", "object_set", "seen")
