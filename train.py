@@ -33,7 +33,11 @@ def _start(preset: Config) -> Callable[..., Command]:
         init_from: Path | None = None,
         distributed: bool = False,
     ) -> Command:
-        """Start a run.
+        """Start a run. A session leaves a report behind, RUN_DIR/report.html.
+
+        The report of a run that has trained for ten minutes or more shows episodes in pictures, which take a minute or
+        two when the session ends, unless a signal has ended it; `python -m pregrasp_jax report RUN_DIR` makes them at
+        any time. They stay on the page as long as the policy does.
 
         Args:
             run_dir: New or empty folder of the run.
@@ -55,7 +59,9 @@ def _resume(stored: Config) -> Callable[..., Command]:
         config: Annotated[Config, tyro.conf.arg(name="")] = stored,
         distributed: bool = False,
     ) -> Command:
-        """Continue a run from its newest intact checkpoint. Only train.minutes and train.episodes may change.
+        """Continue a run from its newest intact checkpoint; its report is written as after the first session.
+
+        Only train.minutes, train.episodes and train.tensorboard may change.
 
         Args:
             run_dir: Folder of the run.
@@ -82,12 +88,22 @@ def _command(session: Command, run_dir: Path, *, distributed: bool) -> Command:
             processes.join()
         code = session()
         if processes.is_first():
-            from pregrasp_jax.cli.report import report_session
-
-            report_session(run_dir)
+            # Other processes would wait for this one while it plays.
+            _report(run_dir, finished=code == 0 and not distributed)
         return code
 
     return run
+
+
+def _report(run_dir: Path, *, finished: bool) -> None:
+    """Write the report; see `report_session`. Ctrl-C ends only that."""
+    try:
+        from pregrasp_jax.cli.report import report_session
+
+        report_session(run_dir, finished=finished)
+    except KeyboardInterrupt:
+        text = f"`python -m pregrasp_jax report {run_dir}` writes the report"
+        print(f"interrupted while the report was written; the training is saved, {text}", file=sys.stderr)
 
 
 def _stored_config() -> Config:

@@ -1,27 +1,17 @@
 """The report: its numbers and curves by hand, what is missing or damaged, and the command."""
 
-import importlib.util
 import re
 import sys
 from pathlib import Path
 
-import jax
-import numpy as np
 import pytest
-from fake_env import fake_env
-from report_files import ROWS, write_evaluation, write_run
+from report_files import ROWS, evaluation_row, write_evaluation, write_run
 
 from pregrasp_jax import __main__ as main_module
-from pregrasp_jax.checkpoint import save_policy
-from pregrasp_jax.cli import player
-from pregrasp_jax.cli.report import report, report_session
 from pregrasp_jax.config import PRESETS, to_dict
-from pregrasp_jax.learning.networks import QNetwork
 from pregrasp_jax.report import build_page, load_evaluations, read_run
 from pregrasp_jax.report.charts import duration, failure_figures, learning_figures, time_figures
 from pregrasp_jax.report.results import BASELINES, missing
-
-ROOT = Path(__file__).parent.parent
 
 
 @pytest.fixture
@@ -43,7 +33,7 @@ def test_the_table_shows_the_numbers_of_the_files(run_dir: Path) -> None:
     other = write_evaluation(run_dir / "evaluations" / "c.json", "random", [0, 1], scene_bank_hash="t")
     other.write_text(other.read_text().replace("2.34567", "null").replace('"std_motions": 0.5', '"std_motions": null'))
     run = read_run(run_dir)
-    cells = _texts(build_page(run, load_evaluations(run), []))
+    cells = _texts(build_page(run, load_evaluations(run)))
     table = cells[: cells.index("this run minus it") + 1 + 3 * 9]
     own, chance, clear = table[9:18], table[18:27], table[27:36]
     assert own == [
@@ -72,7 +62,7 @@ def test_missing_evaluations_are_named_with_their_command(run_dir: Path) -> None
         "python evaluate.py --policy straight --object-set seen --episodes 40 --json "
         f"{run_dir}/evaluations/seen-straight.json"
     )
-    page = build_page(run, load_evaluations(run), [])
+    page = build_page(run, load_evaluations(run))
     assert "random on seen objects, straight on seen objects, lookahead on seen objects" in page
 
 
@@ -102,6 +92,15 @@ def test_curves_against_steps_and_time(run_dir: Path) -> None:
     ]
 
 
+def test_an_interval_stays_with_its_row_where_another_row_has_no_time(tmp_path: Path) -> None:
+    rows = [evaluation_row(100, 10.0, 0.5, [0.25, 0.75]), evaluation_row(200, 40.0, 0.5, [0.0, 1.0])]
+    del rows[0]["time/seconds"]
+    pushes, time = learning_figures(read_run(write_run(tmp_path / "mixed", rows)))
+    assert pushes.count('class="error s0"') == 2 and time.count('class="error s0"') == 1
+    # 0 to 100 % is the whole height of the plotting area.
+    assert 'y1="212" x2="426" y2="12" class="error s0"' in time
+
+
 def test_failures_and_times_are_counted(run_dir: Path) -> None:
     file = write_evaluation(run_dir / "a.json", "first", [1, 1, 1, 0])
     run = read_run(run_dir)
@@ -121,8 +120,12 @@ def test_failures_and_times_are_counted(run_dir: Path) -> None:
 
 def test_a_young_run_has_a_page(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text("seed: 3\n")
-    page = build_page(read_run(tmp_path), [], [])
-    assert "Nothing has been measured yet" in page and "seed 3" in page and "No episodes were played" in page
+    page = build_page(read_run(tmp_path), [])
+    assert (
+        "Nothing has been measured yet" in page
+        and "seed 3" in page
+        and "No episodes of this policy were played" in page
+    )
 
 
 def test_a_line_that_a_crash_cut_is_left_out(run_dir: Path) -> None:
@@ -142,6 +145,9 @@ def test_a_line_that_a_crash_cut_is_left_out(run_dir: Path) -> None:
         ("metrics.jsonl", '{"env_steps": 1}\n{"env\n{"env_steps": 2}\n', "metrics.jsonl: line 2 is damaged, not JSON"),
         ("metrics.jsonl", '{"env_steps": "many"}\n', "metrics.jsonl: line 1 is damaged, it has no env_steps"),
         ("best/evaluation.json", "", "evaluation.json: damaged, not JSON"),
+        ("best/evaluation.json", '{"success_rate": 1, "success_ci95": 7}', "evaluation.json: damaged (success_ci95)"),
+        ("best/evaluation.json", '{"success_ci95": [0.5, "x"]}', "evaluation.json: damaged (success_ci95)"),
+        ("best/evaluation.json", '{"success_rate": "all"}', "evaluation.json: damaged (success_rate)"),
         ("evaluations/x.json", "{}", "x.json: not an evaluation; wanted a file written by evaluate.py --json"),
         ("evaluations/x.json", '{"format": "pregrasp_jax evaluation 1"}', "x.json: damaged evaluation (policy, object"),
     ],
@@ -165,7 +171,7 @@ def test_what_is_damaged_is_one_line(run_dir: Path, monkeypatch, capsys, file: s
         (["--scenes", "0"], "scenes = 0 is out of range; allowed is 1 and more"),
         (["--evaluations", "absent.json"], "absent.json: No such file or directory; wanted a file written by"),
         (["--html", "."], ". is a folder; allowed is the name of a file"),
-        ([], "is neither a run folder nor a policy folder"),
+        ([], "has no policy to play: its first checkpoint is still to come; --films 0 writes the report without"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(run_dir: Path, monkeypatch, capsys, arguments: list[str], said: str) -> None:
@@ -181,53 +187,3 @@ def _main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     except SystemExit as error:
         return int(error.code or 0)
     return 0
-
-
-# --- the command, and training ---------------------------------------------------------------------------------------
-
-
-def test_the_command_plays_until_it_has_enough(run_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    config = PRESETS["ci"]
-    params = QNetwork(width=config.network.width).init(jax.random.key(0), np.zeros((1, 100, 100, 2), np.float32))
-    save_policy(run_dir / "best", params["params"], config, {})
-    monkeypatch.setattr(player, "make_env", lambda config, **_: fake_env(task=config.task))
-    # Drawing needs real hulls, which the world without physics has not.
-    tiles = [(name, np.zeros((8, 8, 3), np.uint8)) for name in ("scene", "height", "Q closed")]
-    monkeypatch.setattr("pregrasp_jax.cli.report.draw_tiles", lambda *_: tiles)
-    report(run_dir, films=1, scenes=4)
-    page = (run_dir / "report.html").read_text()
-    counted = re.search(r"test scenes 0 to (\d) of the seen objects, (\d) with success", page)
-    assert counted
-    played, successes = int(counted[1]) + 1, int(counted[2])
-    shown = page.count('class="good"'), page.count('class="bad"')
-    assert shown == (min(1, successes), min(1, played - successes))
-    assert played == 4 or shown == (1, 1)
-    assert page.count("<img ") == 3 * page.count("<li>") and page.count("<li>") >= 2
-    assert "wrote" in capsys.readouterr().out
-
-
-def test_a_policy_of_another_network_is_one_line(run_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    params = QNetwork(width=0.125).init(jax.random.key(0), np.zeros((1, 100, 100, 2), np.float32))
-    save_policy(run_dir / "best", params["params"], PRESETS["ci"], {})
-    monkeypatch.setattr(player, "make_env", lambda config, **_: fake_env(task=config.task))
-    assert _main(monkeypatch, "report", str(run_dir)) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ") and error.count("\n") == 1 and "does not fit its network" in error
-
-
-def test_a_session_leaves_a_report_and_no_problem_of_it_hurts(run_dir: Path, monkeypatch, capsys) -> None:
-    specification = importlib.util.spec_from_file_location("train_script", ROOT / "train.py")
-    assert specification and specification.loader
-    train = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(train)
-    monkeypatch.setattr("pregrasp_jax.training.session.train", lambda *_, **__: 130)
-    monkeypatch.setattr(sys, "argv", ["train.py", "ci", "--run-dir", str(run_dir)])
-    assert train.main() == 130 and "first" in (run_dir / "report.html").read_text()
-    (run_dir / "metrics.jsonl").write_text("damaged\n")
-    before = (run_dir / "report.html").read_bytes()
-    assert train.main() == 130 and (run_dir / "report.html").read_bytes() == before
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "warning: no report was written" in error and "line 1 is damaged" in error
-    monkeypatch.setattr("pregrasp_jax.cli.report.read_run", lambda _: 1 / 0)
-    report_session(run_dir)
-    assert "division by zero" in capsys.readouterr().err

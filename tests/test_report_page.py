@@ -1,4 +1,4 @@
-"""The page of the report: whole, self-contained, styled, and readable in a browser as narrow as a phone."""
+"""The page of the report: whole, self-contained, styled, and readable on a phone and on a dark laptop."""
 
 import html.parser
 import json
@@ -13,7 +13,7 @@ import pytest
 from report_files import HOSTILE, ROWS, log_row, make_films, write_evaluation, write_run
 
 from pregrasp_jax.config import PRESETS, to_dict
-from pregrasp_jax.report import build_page, load_evaluations, read_run, write_report
+from pregrasp_jax.report import load_evaluations, read_run, write_report
 from pregrasp_jax.report.films import data_uri
 
 
@@ -93,13 +93,13 @@ def test_no_name_or_setting_gets_into_the_page_as_markup(tmp_path: Path) -> None
         file = run_dir / "evaluations" / f"{len(policy)}.json"
         write_evaluation(file, policy, [0, 1], object_set=HOSTILE, camera=HOSTILE, failures={HOSTILE: 1})
     run = read_run(run_dir)
-    page = build_page(run, load_evaluations(run), make_films(), films_note=HOSTILE)
+    page = write_report(run, load_evaluations(run), make_films(), films_note=HOSTILE).read_text()
     assert "<script" not in page and page.count("&lt;script&gt;") > 10
     assert _Page.of(page).open == []
 
 
 PROBE = """<!DOCTYPE html><meta charset="utf-8"><pre id="found">not loaded</pre>
-<iframe id="page" style="width:390px;height:844px;border:0" srcdoc="{page}"></iframe>
+<iframe id="page" style="width:{width}px;height:844px;border:0" srcdoc="{page}"></iframe>
 <script>
 addEventListener("load", () => {{
   const page = document.getElementById("page").contentDocument, root = page.documentElement;
@@ -109,6 +109,7 @@ addEventListener("load", () => {{
   document.getElementById("found").textContent = JSON.stringify({{
     viewport: root.clientWidth, width: Math.max(root.scrollWidth, page.body.scrollWidth), wide,
     pictures: pictures.length, loaded: pictures.filter(i => i.complete && i.naturalWidth > 0).length,
+    paper: getComputedStyle(page.body).backgroundColor,
     small: [...page.querySelectorAll(".chart svg text")].filter(t => t.getBoundingClientRect().height < 9).length,
   }});
 }});
@@ -125,20 +126,27 @@ def _browser() -> str | None:
 
 
 @pytest.mark.skipif(_browser() is None, reason="no Chromium on this machine")
-def test_a_phone_shows_the_page_without_error(page: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("width", "options", "paper"),
+    [(390, [], "rgb(251, 250, 247)"), (1366, ["--blink-settings=preferredColorScheme=0"], "rgb(21, 23, 26)")],
+    ids=["phone", "laptop, dark"],
+)
+def test_a_browser_shows_the_page_without_error(
+    page: Path, tmp_path: Path, width: int, options: list[str], paper: str
+) -> None:
     # A headless window cannot be as narrow as a phone, a frame can; `srcdoc` makes it one origin with the probe.
     probe = tmp_path / "probe.html"
-    probe.write_text(PROBE.format(page=page.read_text().replace("&", "&amp;").replace('"', "&quot;")))
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--enable-logging=stderr"]
+    probe.write_text(PROBE.format(width=width, page=page.read_text().replace("&", "&amp;").replace('"', "&quot;")))
+    options = [*options, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--enable-logging=stderr"]
     profile = f"--user-data-dir={tmp_path / 'profile'}"
-    size, budget = "--window-size=1200,900", "--virtual-time-budget=5000"
+    size, budget = "--window-size=1600,900", "--virtual-time-budget=5000"
     command = [str(_browser()), *options, profile, size, budget, "--dump-dom", probe.as_uri()]
     result = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
     dumped = re.search(r'<pre id="found">(.*?)</pre>', result.stdout, re.S)
     assert dumped, result.stdout[:500]
     found = json.loads(dumped[1])
-    assert found["width"] <= found["viewport"] <= 390
-    assert {key: found[key] for key in ("wide", "pictures", "loaded", "small")} == {
-        **{"wide": [], "pictures": 80, "loaded": 80, "small": 0}
+    assert found["width"] <= found["viewport"] <= width
+    assert {key: found[key] for key in ("wide", "pictures", "loaded", "small", "paper")} == {
+        **{"wide": [], "pictures": 80, "loaded": 80, "small": 0, "paper": paper}
     }
     assert "CONSOLE" not in result.stderr

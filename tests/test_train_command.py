@@ -12,6 +12,7 @@ import pytest
 from scripts import load_script
 
 from pregrasp_jax.command_line import unbox
+from pregrasp_jax.training.run_folder import EXTENDABLE
 
 ROOT = Path(__file__).parent.parent
 train = load_script("train")
@@ -23,6 +24,14 @@ def test_help_shows_the_defaults_of_the_preset(monkeypatch, capsys):
         train.main()
     text = " ".join(capsys.readouterr().out.split())
     assert exit_info.value.code == 0 and "(default: 0.25)" in text and "--replay.hindsight {True,False}" in text
+
+
+def test_help_of_resume_names_all_that_may_change(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["train.py", "resume", "--help"])
+    with pytest.raises(SystemExit):
+        train.main()
+    text = capsys.readouterr().out.split("may change")[0]
+    assert all(name in text for name in EXTENDABLE)
 
 
 BOX = """

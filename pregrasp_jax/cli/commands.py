@@ -22,6 +22,7 @@ from pregrasp_jax.evaluation import load_evaluation
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.statistics import compare as compare_evaluations
 from pregrasp_jax.statistics import format_comparison
+from pregrasp_jax.training.program import enable_compilation_cache
 from pregrasp_jax.types import HullBank
 
 _SHOWN_SCENES = 12
@@ -91,6 +92,7 @@ def scenes(
     env = make_env(config, split=split)
     print(describe_scenes(env.scenes, env.bank))
     if png:
+        enable_compilation_cache()
         _write_png(png, draw_scenes(env, range(min(_SHOWN_SCENES, len(env.scenes)))))
 
 
@@ -118,6 +120,7 @@ def show(
     refuse_unwritable(png)
     if pushes < 0:
         raise ValueError(f"pushes = {pushes} is out of range; allowed is 0 and more")
+    enable_compilation_cache()
     assets_config = AssetsConfig(object_dir=object_dir, object_set=object_set)
     player = make_player(EvaluationConfig(policy=policy, assets=assets_config, camera=camera))
     if not 0 <= scene < len(player.env.scenes):

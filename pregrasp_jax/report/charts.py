@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pregrasp_jax.report.markup import Markup, element, join
-from pregrasp_jax.report.record import SECONDS, RunRecord, is_number
+from pregrasp_jax.report.record import SECONDS, RunRecord, is_interval, is_number
 from pregrasp_jax.report.svg import Point, Series, bar_chart, line_chart
 from pregrasp_jax.training.trainer import PHASES
 
@@ -32,7 +32,7 @@ _STEPS = "environment steps (pushes)"
 def learning_figures(run: RunRecord) -> list[Markup]:
     """Return the learning curves of a run, of those metrics that it has."""
     unit, scale = _time_unit(run.last(SECONDS) or 0.0)
-    time, rate = {"x": SECONDS, "x_scale": scale}, f"training time ({unit})"
+    time: dict[str, Any] = {"x": SECONDS, "x_scale": scale}
     percent: dict[str, Any] = {"y_label": "success (%)", "y_limits": (0.0, 100.0)}
     values = {
         "Q of the taken push": run.curve("train/q_taken"),
@@ -44,7 +44,7 @@ def learning_figures(run: RunRecord) -> list[Markup]:
     }
     figures = [
         _figure("Success against pushes", _success(run), x_label=_STEPS, **percent),
-        _figure("Success against time", _success(run, **time), x_label=rate, **percent),
+        _figure("Success against time", _success(run, **time), x_label=f"training time ({unit})", **percent),
         _figure("Loss", _lines({"loss per update": run.curve("train/loss")}), x_label=_STEPS, y_label="Huber loss"),
         _figure("Q-values", _lines(values), x_label=_STEPS, y_label="Q, discounted reward"),
         _figure("Exploration", _lines(exploring), x_label=_STEPS, y_label="share of pushes", y_limits=(0.0, 1.0)),
@@ -105,18 +105,20 @@ def _time_unit(seconds: float) -> tuple[str, float]:
     return ("min", 1 / 60) if seconds < 180 * 60 else ("h", 1 / 3600)
 
 
-def _success(run: RunRecord, **axis: Any) -> list[Series]:
-    bounds = [row.get("eval/success_ci95") for row in run.metrics if is_number(row.get("eval/success_rate"))]
-    pairs = [pair for pair in bounds if isinstance(pair, list) and len(pair) == 2 and all(map(is_number, pair))]
-    complete = len(pairs) == len(bounds) > 0
+def _success(run: RunRecord, *, x: str = "env_steps", x_scale: float = 1.0) -> list[Series]:
+    """Return the success of validation, with intervals if every point of the curve has one, and of training."""
+    rows = [row for row in run.metrics if is_number(row.get(x)) and is_number(row.get("eval/success_rate"))]
+    pairs = [row["eval/success_ci95"] for row in rows if is_interval(row.get("eval/success_ci95"))]
+    complete = len(pairs) == len(rows) > 0
+    axis: dict[str, Any] = {"x": x, "x_scale": x_scale, "scale": 100.0}
     return [
         Series(
             label="validation, 95 % interval" if complete else "validation",
-            points=run.curve("eval/success_rate", scale=100.0, **axis),
+            points=run.curve("eval/success_rate", **axis),
             intervals=[(100 * low, 100 * high) for low, high in pairs] if complete else (),
             markers=True,
         ),
-        Series(label="training, exploring", points=run.curve("train/success_rate", scale=100.0, **axis)),
+        Series(label="training, exploring", points=run.curve("train/success_rate", **axis)),
     ]
 
 

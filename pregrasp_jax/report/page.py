@@ -2,6 +2,8 @@
 
 import datetime
 import importlib.resources
+import re
+import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,29 +33,49 @@ def write_report(
     films: Sequence[Film] = (),
     *,
     films_note: str = "",
+    policy: str = "",
+    outdated: Sequence[str] = (),
     path: Path | None = None,
 ) -> Path:
     """Write the report of a run, whole or not at all.
+
+    Without new films, those of the page that is there stay if they are of the same policy.
 
     Args:
         run: see `read_run`.
         documents: see `load_evaluations`.
         films: episodes of the run's policy.
         films_note: how they were found, or why there are none.
+        policy: checksum of the run's policy, empty if it has none.
+        outdated: evaluation files that are older than the run's policy.
         path: of the page; `report.html` in the run folder if None.
 
     Returns:
         Where it lies.
     """
     path = path or run.path / REPORT
-    io.write_bytes(path, build_page(run, documents, films, films_note=films_note).encode())
+    episodes = _episodes(films, films_note, policy) if films else kept_episodes(path, policy)
+    io.write_bytes(path, build_page(run, documents, episodes, outdated=outdated).encode())
     return path
 
 
+def kept_episodes(path: Path, policy: str) -> Markup:
+    """Return the section of a page that shows episodes of this policy; nothing if it shows none, or another's.
+
+    Args:
+        path: of a page, which may be absent.
+        policy: checksum.
+    """
+    text = path.read_text(errors="replace") if policy and path.is_file() else ""
+    # What a page shows is escaped and sections are not nested: the first end is that of this one.
+    found = re.search(rf'<section data-policy="{re.escape(policy)}">.*?</section>', text, re.DOTALL)
+    return Markup(found[0] if found else "")
+
+
 def build_page(
-    run: RunRecord, documents: Sequence[dict[str, Any]], films: Sequence[Film], *, films_note: str = ""
+    run: RunRecord, documents: Sequence[dict[str, Any]], episodes: str = "", *, outdated: Sequence[str] = ()
 ) -> str:
-    """Return the page; see `write_report`."""
+    """Return the page; see `write_report`. Without `episodes` it says how to get them."""
     style = importlib.resources.files("pregrasp_jax.report").joinpath("style.css").read_text()
     head = element(
         "head",
@@ -65,9 +87,9 @@ def build_page(
         element("style", Markup(style)),
     )
     sections = [
-        _section("Results", *_results(run, documents)),
+        _section("Results", *_results(run, documents), *_outdated(outdated)),
         _section("Learning curves", *_learning(run)),
-        _section("Episodes", *_films(run, films, films_note)),
+        episodes or _section("Episodes", *_how_to_film(run)),
         _section("Why episodes fail", *_figures(charts.failure_figures(run, results.of_run(run, documents)))),
         _section("Where the time went", *_figures(charts.time_figures(run))),
         _section("Configuration and versions", *_settings(run)),
@@ -76,8 +98,8 @@ def build_page(
     return "<!DOCTYPE html>\n" + element("html", head, body, lang="en") + "\n"
 
 
-def _section(title: str, *content: Markup) -> Markup:
-    return element("section", element("h2", title), "\n", join(content, "\n"))
+def _section(title: str, *content: Markup, policy: str | None = None) -> Markup:
+    return element("section", element("h2", title), "\n", join(content, "\n"), data_policy=policy)
 
 
 def _header(run: RunRecord) -> Iterator[Markup]:
@@ -89,8 +111,8 @@ def _header(run: RunRecord) -> Iterator[Markup]:
     yield element("p", f"{text} Written {written}.", class_="soft")
     facts = []
     if is_number(run.best.get("success_rate")):
-        interval = run.best.get("success_ci95") or []
-        between = "95 % interval {} to {}".format(*map(results.percent, interval)) if len(interval) == 2 else ""
+        interval = run.best.get("success_ci95")
+        between = "95 % interval {} to {}".format(*map(results.percent, interval)) if interval else ""
         facts.append(("best validation success", results.percent(run.best["success_rate"]), between))
         if is_number(run.best.get("env_steps")):
             facts.append(("reached after", f"{run.best['env_steps']:,} pushes", ""))
@@ -140,20 +162,29 @@ def _figures(figures: Sequence[Markup]) -> Iterator[Markup]:
         yield element("p", "Nothing has been measured yet: metrics.jsonl has no such row.")
 
 
-def _films(run: RunRecord, films: Sequence[Film], note: str) -> Iterator[Markup]:
-    if films:
-        yield element("p", _FILM_KEY, class_="soft")
-        ramps = [
-            element("span", class_=f"ramp {name}", role="img", aria_label="dark to bright") for name in ("height", "q")
-        ]
-        legend = ["height 0 ", ramps[0], " 0.30 m; Q-values lowest ", ramps[1], " highest (numbers under each map)"]
-        yield element("p", *legend, class_="soft")
-    if note:
-        yield element("p", note)
-    if not films and not note:
-        yield element("p", "No episodes were played. This command plays some and writes the page anew:")
-        yield element("pre", code(f"python -m pregrasp_jax report {run.path}"))
-    yield from film_strips(films)
+def _outdated(files: Sequence[str]) -> Iterator[Markup]:
+    """Yield which evaluations of this run are of a policy that it had before."""
+    if files:
+        text = (
+            f": {', '.join(files)} is older than the run's policy. What is said of this run from there is true of an "
+            "earlier policy; the same line of evaluate.py measures it anew."
+        )
+        yield element("p", element("strong", "Outdated"), text)
+
+
+def _how_to_film(run: RunRecord) -> Iterator[Markup]:
+    yield element("p", "No episodes of this policy were played. This command plays some and writes the page anew:")
+    yield element("pre", code(f"python -m pregrasp_jax report {shlex.quote(str(run.path))}"))
+
+
+def _episodes(films: Sequence[Film], note: str, policy: str) -> Markup:
+    """Return the section of films, marked with the policy that they are of."""
+    ramps = [
+        element("span", class_=f"ramp {name}", role="img", aria_label="dark to bright") for name in ("height", "q")
+    ]
+    legend = ["height 0 ", ramps[0], " 0.30 m; Q-values lowest ", ramps[1], " highest (numbers under each map)"]
+    texts = [element("p", _FILM_KEY, class_="soft"), element("p", *legend, class_="soft"), element("p", note)]
+    return _section("Episodes", *texts, *film_strips(films), policy=policy)
 
 
 def _settings(run: RunRecord) -> Iterator[Markup]:

@@ -58,6 +58,11 @@ def is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
+def is_interval(value: Any) -> TypeGuard[list[float]]:
+    """Return whether a JSON value is a pair of finite numbers."""
+    return isinstance(value, list) and len(value) == 2 and all(map(is_number, value))
+
+
 def read_run(path: Path) -> RunRecord:
     """Read a run folder; files that a young run does not have yet may be missing.
 
@@ -78,8 +83,17 @@ def read_run(path: Path) -> RunRecord:
         config=config,
         manifest=_read_object(path / "manifest.json"),
         metrics=_read_rows(path / "metrics.jsonl"),
-        best=_read_object(path / "best" / "evaluation.json"),
+        best=_read_best(path / "best" / "evaluation.json"),
     )
+
+
+def _read_best(path: Path) -> dict[str, Any]:
+    """Return what was measured of the best policy, which may lack values but has none of a wrong type."""
+    best = _read_object(path)
+    checks = {"success_rate": is_number, "success_ci95": is_interval, "env_steps": is_number}
+    if damaged := [key for key, is_good in checks.items() if best.get(key) is not None and not is_good(best[key])]:
+        raise ValueError(f"{path}: damaged ({', '.join(damaged)})")
+    return best
 
 
 def _read_object(path: Path) -> dict[str, Any]:
