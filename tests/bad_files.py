@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 from fake_training import PictureEnv, make_config
+from report_files import write_evaluation
 from trimesh.exchange.obj import export_obj
 
 from pregrasp_jax import io
@@ -66,10 +67,17 @@ def make_bad_policies(folder: Path) -> None:
 
 
 def make_bad_evaluations(folder: Path) -> None:
-    document = {"format": "pregrasp_jax evaluation 1", "object_set": "seen", "hull_bank_hash": "h", "rows": []}
-    for name, scenes in (("a", "s"), ("b", "t")):
-        (folder / f"{name}.json").write_text(json.dumps(document | {"scene_bank_hash": scenes}))
     (folder / "list.json").write_text("[]")
+    (folder / "header.json").write_text('{"format": "pregrasp_jax evaluation 1"}')
+    changes: dict[str, dict[str, Any]] = {
+        "a": {},
+        "b": {"scene_bank_hash": "t"},
+        "no_rows": {"rows": []},
+        "odd_rows": {"rows": [{"scene": [0], "target": "can", "success": True}]},
+        "no_config": {"config": "unknown"},
+    }
+    for name, change in changes.items():
+        write_evaluation(folder / f"{name}.json", "clear", [1, 0], **change)
 
 
 def make_bad_dumps(folder: Path) -> None:

@@ -138,6 +138,14 @@ POLICIES = [
         "pregrasp_jax compare {w}/a.json {w}/list.json",
         "list.json: not an evaluation; wanted a file written by evaluate",
     ),
+    (
+        "pregrasp_jax compare {w}/header.json {w}/a.json",
+        "header.json: damaged evaluation (policy, object_set, camera, physics,",
+        "seed, episodes, success_rate, success_ci95, failures, rows); wanted a file written by evaluate.py --json",
+    ),
+    ("pregrasp_jax compare {w}/no_rows.json {w}/no_rows.json", "no_rows.json: damaged evaluation (rows); wanted a"),
+    ("pregrasp_jax compare {w}/a.json {w}/odd_rows.json", "odd_rows.json: damaged evaluation (rows); wanted a file"),
+    ("pregrasp_jax compare {w}/a.json {w}/no_config.json", "no_config.json: damaged evaluation (config); wanted a"),
     ("pregrasp_jax compare {w}/a.json {w}/b.json", "cannot pair: scene_bank_hash is s in the first file and t in the"),
 ]
 

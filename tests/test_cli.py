@@ -12,6 +12,7 @@ import pytest
 import trimesh
 from fake_env import fake_env
 from PIL import Image
+from report_files import write_evaluation
 from scripts import load_script
 
 from pregrasp_jax import __main__ as main_module
@@ -170,18 +171,10 @@ def test_plain_progress_ends_with_a_line(capsys: pytest.CaptureFixture[str]) -> 
     assert captured.err == "episode 4 of 4 | success 100 % | left 0:00:00\n"
 
 
-def _evaluation_file(path: Path, policy: str, successes: list[int], **changes: Any) -> str:
-    rows = [{"scene": i, "target": "can", "success": bool(s)} for i, s in enumerate(successes)]
-    header = {"object_set": "seen", "hull_bank_hash": "h", "scene_bank_hash": "s", "camera": "orthographic"}
-    document = {"format": "pregrasp_jax evaluation 1", "policy": policy, "physics": "native", "seed": 0, "rows": rows}
-    path.write_text(json.dumps({**document, **header, **changes}))
-    return str(path)
-
-
 def test_compare_prints_and_writes(run: Any, tmp_path: Path) -> None:
-    a = _evaluation_file(tmp_path / "a.json", "mine", [1, 1, 1, 1, 1, 1, 0])
-    b = _evaluation_file(tmp_path / "b.json", "clear", [0, 0, 0, 0, 0, 0, 1])
-    code, out, _ = run(main_module.main, "compare", a, b, "--json", str(tmp_path / "c.json"))
+    a = write_evaluation(tmp_path / "a.json", "mine", [1, 1, 1, 1, 1, 1, 0])
+    b = write_evaluation(tmp_path / "b.json", "clear", [0, 0, 0, 0, 0, 0, 1])
+    code, out, _ = run(main_module.main, "compare", str(a), str(b), "--json", str(tmp_path / "c.json"))
     assert code == 0
     assert "mine" in out and "only A 6, only B 1" in out and "p = 0.125" in out
     written = json.loads((tmp_path / "c.json").read_text())
