@@ -1,5 +1,6 @@
 """A folder of files that nobody can use, and why not."""
 
+import dataclasses
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.mesh_file import MAX_BYTES
 from pregrasp_jax.checkpoint import Ring, save, save_policy, trees, write_config
-from pregrasp_jax.config import PRESETS
+from pregrasp_jax.config import PRESETS, TaskConfig
 from pregrasp_jax.training.dump import make_dump
 from pregrasp_jax.training.mishap import no_mishap
 
@@ -41,8 +42,9 @@ def make_bad_files(folder: Path) -> None:
 
 def make_bad_runs(folder: Path) -> None:
     write_config(folder / "run" / "config.yaml", PRESETS["ci"])
-    (folder / "typo").mkdir()
-    (folder / "typo" / "config.yaml").write_text("sead: 1\n")
+    for name, text in {"typo": "sead: 1\n", "range": "task: {r_in: 3.0}\n"}.items():
+        (folder / name).mkdir()
+        (folder / name / "config.yaml").write_text(text)
     manifest = {"hashes": {"hull bank": "of yesterday"}, "sessions": []}
     for name, text in {"other": json.dumps(manifest), "cut": json.dumps(manifest)[:9], "list": "[]"}.items():
         write_config(folder / name / "config.yaml", make_config())
@@ -60,10 +62,17 @@ def make_bad_policies(folder: Path) -> None:
     (folder / "noise").write_bytes(b"not a policy")
     (folder / "foreign.safetensors").write_bytes(trees.encode(arrays))
     newer = {"config": config, "evaluation": "{}", "checksum": trees.checksum(arrays)}
-    (folder / "newer.safetensors").write_bytes(trees.encode(arrays, newer))
-    for name in ("small", "altered"):
+    for name, number in (("newer", 1), ("newest", 3)):
+        about = newer | {"format": f"pregrasp_jax policy {number}"}
+        (folder / f"{name}.safetensors").write_bytes(trees.encode(arrays, about))
+    for name in ("small", "altered", "header"):
         save_policy(folder / name, arrays, PRESETS["ci"], {})
     flip_last_byte(folder / "altered" / "params.safetensors")
+    header = folder / "header" / "params.safetensors"
+    header.write_bytes(header.read_bytes().replace(b'"r_out\\": 0.2', b'"r_out\\": 0.3'))
+    save_policy(folder / "wide", arrays, dataclasses.replace(PRESETS["ci"], task=TaskConfig(r_out=30.0)), {})
+    bf16 = json.dumps({"a": {"dtype": "BF16", "shape": [1], "data_offsets": [0, 2]}}).encode()
+    (folder / "bf16.safetensors").write_bytes(len(bf16).to_bytes(8, "little") + bf16 + bytes(2))
 
 
 def make_bad_evaluations(folder: Path) -> None:

@@ -78,6 +78,7 @@ PLACES = [
 
 RUNS = [
     ("train resume {w}/typo", "{w}/typo/config.yaml: unknown config key sead; allowed here: assets, exploration"),
+    ("train resume {w}/range", "{w}/range/config.yaml: task.r_in = 3.0 is out of range; allowed is 0.005 to 0.5"),
     ("train resume {w}/run --seed 4", "a changed configuration (seed: 0 -> 4); allowed to change: train.minutes"),
     (
         "train resume {w}/other",
@@ -114,6 +115,22 @@ POLICIES = [
         "newer.safetensors was written by another version",
         "colour",
         "allowed",
+    ),
+    (
+        "evaluate --policy {w}/newest.safetensors",
+        "newest.safetensors was written by another version of this package: pregrasp_jax policy 3",
+    ),
+    (
+        "evaluate --policy {w}/bf16.safetensors",
+        "bf16.safetensors is damaged or not of this package (its arrays are BF16); allowed: pretrained, a run folder",
+    ),
+    (
+        "evaluate --policy {w}/header",
+        "{w}/header/params.safetensors is altered (checksum differs); allowed: pretrained, a run",
+    ),
+    (
+        "evaluate --policy {w}/wide",
+        "{w}/wide/params.safetensors was written by another version of this package: task.r_out = 30.0 is out of range",
     ),
     (
         "evaluate --policy {w}/altered",
