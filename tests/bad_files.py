@@ -146,6 +146,11 @@ def too_wide_for_targets(folder: Path) -> None:
         box(0.12, 0.12, 0.15 + 0.01 * number).export(folder / f"{number}.stl")
 
 
+def too_few(folder: Path) -> None:
+    for number, height in enumerate((0.15, 0.16, 0.02)):
+        box(0.06, 0.07, height).export(folder / f"{number}.stl")
+
+
 def too_many_bytes(folder: Path) -> None:
     with (folder / "m.stl").open("wb") as file:
         file.truncate(MAX_BYTES + 2**20)  # sparse: it takes no room
@@ -176,10 +181,12 @@ BAD_MESHES = {
     "folder": lambda folder: (folder / "m.obj").mkdir(),
     "link": link_outside,
     "dangling": lambda folder: (folder / "m.stl").symlink_to(folder / "nothing.stl"),
+    "loop": lambda folder: (folder / "m.stl").symlink_to("m.stl"),
     "outside": name_outside,
     "missing": name_missing,
     "many_bytes": too_many_bytes,
     "no_target": too_wide_for_targets,
+    "few": too_few,
     "setting": text("objects.yaml", "m.stl: {colour: red}\n"),
 }
 """What is wrong -> writes a folder of meshes of which that is true."""

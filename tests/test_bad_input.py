@@ -3,6 +3,7 @@ nothing written.
 """
 
 import logging
+import os
 import sys
 from concurrent.futures import Future
 from pathlib import Path
@@ -210,10 +211,12 @@ MESHES = {
     "folder": "m.obj: missing or not a file; allowed are files inside the folder",
     "link": "link.stl: link that leads out of the folder; allowed are files inside of it",
     "dangling": "m.stl: missing or not a file; allowed are files inside the folder",
+    "loop": "m.stl: missing or not a file; allowed are files inside the folder",
     "outside": "../outside.stl: listed in objects.yaml but leads out of the folder",
     "missing": "gone.stl: listed in objects.yaml but missing; allowed are names of files",
     "many_bytes": "m.stl: file of 257 MB; allowed are 256 MB, decimate it first",
     "no_target": "{f}: 5 usable 'seen' objects of which 0 can be targets; allowed are at least 5 objects and 1 target",
+    "few": "{f}: 2 usable 'seen' objects of which 2 can be targets; allowed are at least 5 objects and 1 target. 1 were",
     "setting": "{f}/objects.yaml: m.stl: unknown setting 'colour'; allowed are scale, up, mass, density, friction",
 }
 TRAIN_ON = "train ci --run-dir {w}/new --assets.object-dir "
@@ -317,10 +320,32 @@ def test_a_replay_that_does_not_fit_is_refused_before_the_start(refusal, monkeyp
     assert f"GB of {what}" in said and "0.00 GB are free; a smaller replay.capacity helps" in said
 
 
-def test_a_cache_that_cannot_be_written_is_refused_before_scenes_are_packed(world, refusal, monkeypatch):
+@pytest.mark.parametrize(
+    ("command_line", "file"),
+    [("pregrasp_jax scenes", "scenes/test-"), ("pregrasp_jax assets {w}/meshes/no_target", "hulls/")],
+)
+def test_a_cache_that_cannot_be_written_is_refused_before_the_work(world, refusal, monkeypatch, command_line, file):
     monkeypatch.setenv("PREGRASP_JAX_CACHE", str(world / "file" / "cache"))
-    said = refusal("pregrasp_jax scenes")
-    assert f"error: {world}/file/cache/scenes/test-" in said and f"{world}/file is not a writable folder" in said
+    monkeypatch.setattr(meshes, "ProcessPoolExecutor", None)
+    said = refusal(command_line)
+    assert f"error: {world}/file/cache/{file}" in said and f"{world}/file is not a writable folder" in said
+
+
+@pytest.mark.parametrize(
+    ("command_line", "file"),
+    [
+        ("train ci --run-dir {w}/new", "{w}/new/config.yaml"),
+        ("evaluate --policy clear --json {w}/new.json", "{w}/new.json"),
+        ("pregrasp_jax show --png {w}/new.png", "{w}/new.png"),
+        ("pregrasp_jax scenes", "/cache/scenes/test-"),
+        ("pregrasp_jax assets {w}/meshes/no_target --png {w}/new.png", "{w}/new.png"),
+    ],
+)
+def test_a_folder_without_the_right_to_write_is_refused(world, refusal, monkeypatch, command_line, file):
+    """As root, who runs these tests in a container, there is none: the system's answer is a fake."""
+    monkeypatch.setattr(os, "access", lambda _, mode: mode != os.W_OK)
+    said = refusal(command_line)
+    assert f"{file.format(w=world)}" in said and "is not a writable folder; allowed is one that is" in said
 
 
 @pytest.mark.slow
