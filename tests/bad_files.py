@@ -18,7 +18,7 @@ from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.mesh_file import MAX_BYTES
 from pregrasp_jax.checkpoint import Ring, save, save_policy, trees, write_config
-from pregrasp_jax.config import PRESETS, TaskConfig
+from pregrasp_jax.config import PRESETS, ReplayConfig, TaskConfig
 from pregrasp_jax.training.dump import make_dump
 from pregrasp_jax.training.mishap import no_mishap
 
@@ -50,8 +50,9 @@ def make_bad_runs(folder: Path) -> None:
         write_config(folder / name / "config.yaml", make_config())
         (folder / name / "manifest.json").write_text(text)
     ring = Ring({"height": np.zeros((2, 2), np.uint8)}, 1)
-    for name in ("foreign", "damaged"):
-        write_config(folder / name / "config.yaml", make_config())
+    large = dataclasses.replace(make_config(), replay=ReplayConfig(capacity=1_000_000))
+    for name, config in {"foreign": make_config(), "damaged": make_config(), "large": large}.items():
+        write_config(folder / name / "config.yaml", config)
         save(folder / name / "checkpoints", 7, {"colour": np.zeros(3)}, ring, {})
         (folder / name / "manifest.json").write_text(json.dumps({"hashes": FAKE_HASHES, "sessions": []}))
     flip_last_byte(folder / "damaged" / "checkpoints" / "000000007" / "state.safetensors")

@@ -216,7 +216,7 @@ MESHES = {
     "missing": "gone.stl: listed in objects.yaml but missing; allowed are names of files",
     "many_bytes": "m.stl: file of 257 MB; allowed are 256 MB, decimate it first",
     "no_target": "{f}: 5 usable 'seen' objects of which 0 can be targets; allowed are at least 5 objects and 1 target",
-    "few": "{f}: 2 usable 'seen' objects of which 2 can be targets; allowed are at least 5 objects and 1 target. 1 were",
+    "few": "{f}: 2 usable 'seen' objects of which 2 can be targets; allowed are at least 5 objects and 1 target",
     "setting": "{f}/objects.yaml: m.stl: unknown setting 'colour'; allowed are scale, up, mass, density, friction",
 }
 TRAIN_ON = "train ci --run-dir {w}/new --assets.object-dir "
@@ -313,11 +313,36 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(world, refusal, row):
         assert part.replace("{w}", str(world)) in error
 
 
-@pytest.mark.parametrize("what", ["memory", "disk"])
-def test_a_replay_that_does_not_fit_is_refused_before_the_start(refusal, monkeypatch, what):
-    monkeypatch.setattr(resources, f"available_{what}", lambda *_: 10**5)
-    said = refusal("train ci --run-dir {w}/new --network.width 1")
-    assert f"GB of {what}" in said and "0.00 GB are free; a smaller replay.capacity helps" in said
+NEW_RUN = "train ci --run-dir {w}/new --network.width 1"
+
+
+@pytest.mark.parametrize(
+    ("command_line", "what", "free", "advice"),
+    [
+        (
+            NEW_RUN,
+            "memory",
+            0,
+            "0.00 GB are free; allowed is more room: 1.00 GB are needed even without the replay's obs",
+        ),
+        (
+            NEW_RUN,
+            "disk",
+            0,
+            "0.00 GB are free; allowed is more room: 0.00 GB are needed even without the replay's obs",
+        ),
+        (NEW_RUN + " --replay.capacity 1000000", "memory", 2e9, "2.00 GB are free; a smaller replay.capacity helps"),
+        (NEW_RUN + " --replay.capacity 1000000", "disk", 2e9, "2.00 GB are free; a smaller replay.capacity helps"),
+        ("train resume {w}/large", "memory", 2e9, "2.00 GB are free; allowed is more room, or a new run (--init-from"),
+        ("train resume {w}/large", "disk", 2e9, "2.00 GB are free; allowed is more room, or a new run (--init-from"),
+    ],
+)
+def test_a_replay_that_does_not_fit_is_refused_before_the_start(refusal, monkeypatch, command_line, what, free, advice):
+    monkeypatch.setattr(resources, f"available_{what}", lambda *_: int(free))
+    other = {"memory": "disk", "disk": "memory"}[what]
+    monkeypatch.setattr(resources, f"available_{other}", lambda *_: 10**15)
+    said = refusal(command_line)
+    assert f"GB of {what}" in said and advice in said
 
 
 @pytest.mark.parametrize(
