@@ -1,6 +1,8 @@
 """Command lines: what they accept, print and write."""
 
 import json
+import os
+import platform
 import re
 import sys
 from pathlib import Path
@@ -15,14 +17,18 @@ from PIL import Image
 from report_files import write_evaluation
 from scripts import load_script
 
+import pregrasp_jax
 from pregrasp_jax import __main__ as main_module
+from pregrasp_jax import io
 from pregrasp_jax.checkpoint import save_policy
 from pregrasp_jax.cli import commands, doctor, film, player, progress
 from pregrasp_jax.cli.evaluate import evaluate
 from pregrasp_jax.cli.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.config import PRESETS, AssetsConfig, Config, PhysicsConfig, SceneConfig, TaskConfig
 from pregrasp_jax.learning.networks import QNetwork
+from pregrasp_jax.physics import mjx_version
 from pregrasp_jax.scene.bank import SceneBank
+from pregrasp_jax.training import resources
 
 EVALUATE = load_script("evaluate")
 
@@ -186,7 +192,68 @@ def test_doctor_names_what_a_bug_report_needs(run: Any) -> None:
     assert code == 0
     lines = dict(line.split(maxsplit=1) for line in out.splitlines())
     assert {"python", "mujoco", "jax", "cores", "NPROC", "cache", "free"} <= set(lines)
-    assert dict(doctor.describe())["engine native"] == "works"
+    found = dict(doctor.describe())
+    assert found["engine native"] == "works"
+    assert found["engine mjx"] == f"mujoco-mjx {mjx_version.SUPPORTED[0]}, supported"
+    assert re.fullmatch(r".* \(\d+\.\d\d GB, \d+\.\d\d GB free\)", found["cache"])
+
+
+def test_doctor_outlives_what_it_diagnoses(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> Any:
+        raise RuntimeError("no backend:\n  none at all")
+
+    broken = {"jax devices": (jax, "devices"), "free memory": (resources, "available_memory")}
+    broken |= {"free disk here": (Path, "cwd"), "cache": (io, "cache_dir"), "machine": (platform, "release")}
+    for owner, name in broken.values():
+        monkeypatch.setattr(owner, name, fail)
+    monkeypatch.setattr(mjx_version, "installed", lambda: "3.16.0")
+    code, _, _ = run(main_module.main, "doctor")
+    found = dict(doctor.describe())
+    assert code == 0 and found["engine native"] == "works"
+    assert {found[name] for name in broken} == {"failed (RuntimeError: no backend: none at all)"}
+    assert found["engine mjx"] == "unsupported: physics.engine = 'mjx': mujoco-mjx 3.16.0 is installed; allowed: 3.17.0"
+
+
+def test_doctor_measures_a_cache_that_is_being_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PREGRASP_JAX_CACHE", str(tmp_path))
+    (tmp_path / "whole.npz").write_bytes(bytes(20_000_000))
+    (tmp_path / ".gone.partial").symlink_to("nothing")
+    monkeypatch.setattr(Path, "is_file", lambda _: True)  # as it was when the folder was listed
+    assert dict(doctor.describe())["cache"].startswith(f"{tmp_path} (0.02 GB, ")
+
+
+@pytest.mark.parametrize(
+    ("cores", "nproc", "by_guard", "finding"),
+    [
+        (2, "4", True, "4, set by pregrasp_jax: enough threads for XLA"),
+        (2, "4", False, "4, set by the environment: enough threads for XLA"),
+        (8, None, False, "unset: enough threads for XLA"),
+        (2, None, False, "unset: MJX may deadlock; set NPROC=4 before Python starts"),
+        (2, "abc", False, "abc, set by the environment: MJX may deadlock; set NPROC=4 before Python starts"),
+    ],
+)
+def test_doctor_says_who_set_nproc(
+    monkeypatch: pytest.MonkeyPatch, cores: int, nproc: str | None, by_guard: bool, finding: str
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    monkeypatch.setattr(pregrasp_jax, "NPROC_BY_GUARD", by_guard, raising=False)
+    monkeypatch.delenv("NPROC")
+    if nproc:
+        monkeypatch.setenv("NPROC", nproc)
+    assert dict(doctor.describe())["NPROC"] == finding
+
+
+@pytest.mark.parametrize("nproc", ["abc", "", "2", None])
+def test_a_small_machine_is_guarded_whatever_nproc_says(monkeypatch: pytest.MonkeyPatch, nproc: str | None) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    monkeypatch.setenv("NPROC", nproc or "")
+    if nproc is None:
+        monkeypatch.delenv("NPROC")
+    with pytest.warns(RuntimeWarning, match="jax was imported before pregrasp_jax"):
+        assert not pregrasp_jax.guard_small_machine()
+    monkeypatch.delitem(sys.modules, "jax")
+    assert pregrasp_jax.guard_small_machine() and os.environ["NPROC"] == "4"
+    assert not pregrasp_jax.guard_small_machine(), "it is enough already"
 
 
 def test_assets_lists_and_draws_a_folder(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
