@@ -214,6 +214,19 @@ def test_doctor_outlives_what_it_diagnoses(run: Any, monkeypatch: pytest.MonkeyP
     assert found["engine mjx"] == "unsupported: physics.engine = 'mjx': mujoco-mjx 3.16.0 is installed; allowed: 3.17.0"
 
 
+def test_doctor_says_where_an_error_without_words_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So jax answers JAX_PLATFORMS=cuda where it was installed for the CPU."""
+
+    def fail() -> Any:
+        raise AssertionError
+
+    monkeypatch.setattr(jax, "devices", fail)
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    found = dict(doctor.describe())
+    assert found["JAX_PLATFORMS"] == "cuda"
+    assert re.fullmatch(r"failed \(AssertionError: in test_cli\.py, line \d+\)", found["jax devices"])
+
+
 def test_doctor_measures_a_cache_that_is_being_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PREGRASP_JAX_CACHE", str(tmp_path))
     (tmp_path / "whole.npz").write_bytes(bytes(20_000_000))

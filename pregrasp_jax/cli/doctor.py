@@ -4,6 +4,7 @@ import contextlib
 import importlib.util
 import os
 import platform
+import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -28,6 +29,7 @@ def describe() -> list[tuple[str, str]]:
         "machine": lambda: f"{platform.machine()}, {platform.system()} {platform.release()}",
         "cores": lambda: f"{_num_cores()} usable of {os.cpu_count()}",
         "NPROC": _describe_guard,
+        "JAX_PLATFORMS": lambda: os.environ.get("JAX_PLATFORMS") or "unset",
         "jax devices": lambda: ", ".join(f"{device.platform} {device.device_kind}" for device in jax.devices()),
         "engine native": _describe_native,
         "engine mjx": _describe_mjx,
@@ -50,7 +52,9 @@ def _finding(probe: Callable[[], str]) -> str:
     try:
         return probe()
     except Exception as error:  # whatever is broken here is what the user wants to know
-        return f"failed ({type(error).__name__}: {' '.join(str(error).split())})"
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        text = " ".join(str(error).split()) or f"in {Path(where.filename).name}, line {where.lineno}"
+        return f"failed ({type(error).__name__}: {text})"
 
 
 def _num_cores() -> int:
