@@ -69,11 +69,13 @@ def make_bad_policies(folder: Path) -> None:
     for name in ("small", "altered", "header"):
         save_policy(folder / name, arrays, PRESETS["ci"], {})
     flip_last_byte(folder / "altered" / "params.safetensors")
-    header = folder / "header" / "params.safetensors"
-    header.write_bytes(header.read_bytes().replace(b'"r_out\\": 0.2', b'"r_out\\": 0.3'))
+    changed = folder / "header" / "params.safetensors"
+    changed.write_bytes(changed.read_bytes().replace(b'"r_out\\": 0.2', b'"r_out\\": 0.3'))
     save_policy(folder / "wide", arrays, dataclasses.replace(PRESETS["ci"], task=TaskConfig(r_out=30.0)), {})
-    bf16 = json.dumps({"a": {"dtype": "BF16", "shape": [1], "data_offsets": [0, 2]}}).encode()
-    (folder / "bf16.safetensors").write_bytes(len(bf16).to_bytes(8, "little") + bf16 + bytes(2))
+    for name, kind in {"bf16": "BF16", "no_metadata": "F16"}.items():
+        layout = {"__metadata__": None, "a": {"dtype": kind, "shape": [1], "data_offsets": [0, 2]}}
+        header = json.dumps(layout).encode()
+        (folder / f"{name}.safetensors").write_bytes(len(header).to_bytes(8, "little") + header + bytes(2))
 
 
 def make_bad_evaluations(folder: Path) -> None:

@@ -111,6 +111,7 @@ POLICIES = [
         "foreign.safetensors was not written by this package",
         "allowed: pretrained, a run",
     ),
+    ("evaluate --policy {w}/no_metadata.safetensors", "no_metadata.safetensors was not written by this package"),
     (
         "evaluate --policy {w}/newer.safetensors",
         "newer.safetensors was written by another version",

@@ -93,7 +93,7 @@ def read_metadata(data: bytes) -> dict[str, str]:
     A safetensors file starts with the length of its JSON header, 8 bytes little-endian.
     """
     length = int.from_bytes(data[:8], "little")
-    return json.loads(data[8 : 8 + length]).get("__metadata__", {})
+    return json.loads(data[8 : 8 + length]).get("__metadata__") or {}
 
 
 def _name(path: tuple[Any, ...]) -> str:
