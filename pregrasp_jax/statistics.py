@@ -6,7 +6,7 @@ Host-side arithmetic on counts; nothing here needs jax.
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, TypeGuard
 
 _Z95 = 1.959963984540054
 """Normal quantile of a two-sided 95 % interval."""
@@ -15,6 +15,16 @@ _OUTCOMES = ("both", "only A", "only B", "neither")
 
 _SAME = ("object_set", "scene_bank_hash", "hull_bank_hash")
 """What two evaluations must share before their episodes can be paired."""
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """Return whether a JSON value is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def is_interval(value: Any) -> TypeGuard[list[float]]:
+    """Return whether a JSON value is a pair of finite numbers."""
+    return isinstance(value, list) and len(value) == 2 and all(map(is_number, value))
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:

@@ -1,5 +1,6 @@
 """A folder of files that nobody can use, and why not."""
 
+import dataclasses
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 from fake_training import PictureEnv, make_config
+from report_files import write_evaluation
 from trimesh.exchange.obj import export_obj
 
 from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.mesh_file import MAX_BYTES
 from pregrasp_jax.checkpoint import Ring, save, save_policy, trees, write_config
-from pregrasp_jax.config import PRESETS
+from pregrasp_jax.config import PRESETS, ReplayConfig, TaskConfig
 from pregrasp_jax.training.dump import make_dump
 from pregrasp_jax.training.mishap import no_mishap
 
@@ -40,15 +42,17 @@ def make_bad_files(folder: Path) -> None:
 
 def make_bad_runs(folder: Path) -> None:
     write_config(folder / "run" / "config.yaml", PRESETS["ci"])
-    (folder / "typo").mkdir()
-    (folder / "typo" / "config.yaml").write_text("sead: 1\n")
+    for name, text in {"typo": "sead: 1\n", "range": "task: {r_in: 3.0}\n"}.items():
+        (folder / name).mkdir()
+        (folder / name / "config.yaml").write_text(text)
     manifest = {"hashes": {"hull bank": "of yesterday"}, "sessions": []}
     for name, text in {"other": json.dumps(manifest), "cut": json.dumps(manifest)[:9], "list": "[]"}.items():
         write_config(folder / name / "config.yaml", make_config())
         (folder / name / "manifest.json").write_text(text)
     ring = Ring({"height": np.zeros((2, 2), np.uint8)}, 1)
-    for name in ("foreign", "damaged"):
-        write_config(folder / name / "config.yaml", make_config())
+    large = dataclasses.replace(make_config(), replay=ReplayConfig(capacity=1_000_000))
+    for name, config in {"foreign": make_config(), "damaged": make_config(), "large": large}.items():
+        write_config(folder / name / "config.yaml", config)
         save(folder / name / "checkpoints", 7, {"colour": np.zeros(3)}, ring, {})
         (folder / name / "manifest.json").write_text(json.dumps({"hashes": FAKE_HASHES, "sessions": []}))
     flip_last_byte(folder / "damaged" / "checkpoints" / "000000007" / "state.safetensors")
@@ -59,17 +63,33 @@ def make_bad_policies(folder: Path) -> None:
     (folder / "noise").write_bytes(b"not a policy")
     (folder / "foreign.safetensors").write_bytes(trees.encode(arrays))
     newer = {"config": config, "evaluation": "{}", "checksum": trees.checksum(arrays)}
-    (folder / "newer.safetensors").write_bytes(trees.encode(arrays, newer))
-    for name in ("small", "altered"):
+    for name, number in (("newer", 1), ("newest", 3)):
+        about = newer | {"format": f"pregrasp_jax policy {number}"}
+        (folder / f"{name}.safetensors").write_bytes(trees.encode(arrays, about))
+    for name in ("small", "altered", "header"):
         save_policy(folder / name, arrays, PRESETS["ci"], {})
     flip_last_byte(folder / "altered" / "params.safetensors")
+    changed = folder / "header" / "params.safetensors"
+    changed.write_bytes(changed.read_bytes().replace(b'"r_out\\": 0.2', b'"r_out\\": 0.3'))
+    save_policy(folder / "wide", arrays, dataclasses.replace(PRESETS["ci"], task=TaskConfig(r_out=30.0)), {})
+    for name, kind in {"bf16": "BF16", "no_metadata": "F16"}.items():
+        layout = {"__metadata__": None, "a": {"dtype": kind, "shape": [1], "data_offsets": [0, 2]}}
+        header = json.dumps(layout).encode()
+        (folder / f"{name}.safetensors").write_bytes(len(header).to_bytes(8, "little") + header + bytes(2))
 
 
 def make_bad_evaluations(folder: Path) -> None:
-    document = {"format": "pregrasp_jax evaluation 1", "object_set": "seen", "hull_bank_hash": "h", "rows": []}
-    for name, scenes in (("a", "s"), ("b", "t")):
-        (folder / f"{name}.json").write_text(json.dumps(document | {"scene_bank_hash": scenes}))
     (folder / "list.json").write_text("[]")
+    (folder / "header.json").write_text('{"format": "pregrasp_jax evaluation 1"}')
+    changes: dict[str, dict[str, Any]] = {
+        "a": {},
+        "b": {"scene_bank_hash": "t"},
+        "no_rows": {"rows": []},
+        "odd_rows": {"rows": [{"scene": [0], "target": "can", "success": True}]},
+        "no_config": {"config": "unknown"},
+    }
+    for name, change in changes.items():
+        write_evaluation(folder / f"{name}.json", "clear", [1, 0], **change)
 
 
 def make_bad_dumps(folder: Path) -> None:
@@ -129,6 +149,11 @@ def too_wide_for_targets(folder: Path) -> None:
         box(0.12, 0.12, 0.15 + 0.01 * number).export(folder / f"{number}.stl")
 
 
+def too_few(folder: Path) -> None:
+    for number, height in enumerate((0.15, 0.16, 0.02)):
+        box(0.06, 0.07, height).export(folder / f"{number}.stl")
+
+
 def too_many_bytes(folder: Path) -> None:
     with (folder / "m.stl").open("wb") as file:
         file.truncate(MAX_BYTES + 2**20)  # sparse: it takes no room
@@ -159,10 +184,12 @@ BAD_MESHES = {
     "folder": lambda folder: (folder / "m.obj").mkdir(),
     "link": link_outside,
     "dangling": lambda folder: (folder / "m.stl").symlink_to(folder / "nothing.stl"),
+    "loop": lambda folder: (folder / "m.stl").symlink_to("m.stl"),
     "outside": name_outside,
     "missing": name_missing,
     "many_bytes": too_many_bytes,
     "no_target": too_wide_for_targets,
+    "few": too_few,
     "setting": text("objects.yaml", "m.stl: {colour: red}\n"),
 }
 """What is wrong -> writes a folder of meshes of which that is true."""

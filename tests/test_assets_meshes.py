@@ -116,10 +116,28 @@ def test_cache_is_used_and_depends_on_content_settings_and_health(tmp_path, cach
         again, _ = load_object_dir(folder, "seen")
     assert again.content_hash == first.content_hash
     entry.write_bytes(entry.read_bytes()[:-200])
-    assert load_object_dir(folder, "seen")[0].content_hash == first.content_hash
+    with pytest.warns(UserWarning, match=rf"{entry.name} is damaged; one\.stl is decomposed anew"):
+        assert load_object_dir(folder, "seen")[0].content_hash == first.content_hash
     (folder / "objects.yaml").write_text("one.stl: {mass: 0.4}")
     assert float(load_object_dir(folder, "seen")[0].mass[0]) == pytest.approx(0.4)
     assert len(list(cache.iterdir())) == 2
+
+
+def test_an_unreadable_mesh_costs_one_mesh(tmp_path, monkeypatch):
+    """Also where the rights of root make every file readable."""
+    for name in ("bad", "good"):
+        write(tmp_path / f"{name}.stl", box())
+    read_bytes = Path.read_bytes
+
+    def refuse_bad(path: Path) -> bytes:
+        if path.name == "bad.stl":
+            raise PermissionError(13, "Permission denied", str(path))
+        return read_bytes(path)
+
+    monkeypatch.setattr(Path, "read_bytes", refuse_bad)
+    bank, refusals = load_object_dir(tmp_path, "seen")
+    assert bank.names == ("good",)
+    assert refusals == [Refusal("bad.stl", "cannot be read (Permission denied); allowed are readable files")]
 
 
 def test_a_crashing_decomposition_costs_one_mesh(tmp_path, monkeypatch):

@@ -3,6 +3,7 @@ nothing written.
 """
 
 import logging
+import os
 import sys
 from concurrent.futures import Future
 from pathlib import Path
@@ -78,6 +79,7 @@ PLACES = [
 
 RUNS = [
     ("train resume {w}/typo", "{w}/typo/config.yaml: unknown config key sead; allowed here: assets, exploration"),
+    ("train resume {w}/range", "{w}/range/config.yaml: task.r_in = 3.0 is out of range; allowed is 0.005 to 0.5"),
     ("train resume {w}/run --seed 4", "a changed configuration (seed: 0 -> 4); allowed to change: train.minutes"),
     (
         "train resume {w}/other",
@@ -109,11 +111,28 @@ POLICIES = [
         "foreign.safetensors was not written by this package",
         "allowed: pretrained, a run",
     ),
+    ("evaluate --policy {w}/no_metadata.safetensors", "no_metadata.safetensors was not written by this package"),
     (
         "evaluate --policy {w}/newer.safetensors",
         "newer.safetensors was written by another version",
         "colour",
         "allowed",
+    ),
+    (
+        "evaluate --policy {w}/newest.safetensors",
+        "newest.safetensors was written by another version of this package: pregrasp_jax policy 3",
+    ),
+    (
+        "evaluate --policy {w}/bf16.safetensors",
+        "bf16.safetensors is damaged or not of this package (its arrays are BF16); allowed: pretrained, a run folder",
+    ),
+    (
+        "evaluate --policy {w}/header",
+        "{w}/header/params.safetensors is altered (checksum differs); allowed: pretrained, a run",
+    ),
+    (
+        "evaluate --policy {w}/wide",
+        "{w}/wide/params.safetensors was written by another version of this package: task.r_out = 30.0 is out of range",
     ),
     (
         "evaluate --policy {w}/altered",
@@ -138,6 +157,14 @@ POLICIES = [
         "pregrasp_jax compare {w}/a.json {w}/list.json",
         "list.json: not an evaluation; wanted a file written by evaluate",
     ),
+    (
+        "pregrasp_jax compare {w}/header.json {w}/a.json",
+        "header.json: damaged evaluation (policy, object_set, camera, physics,",
+        "seed, episodes, success_rate, success_ci95, failures, rows); wanted a file written by evaluate.py --json",
+    ),
+    ("pregrasp_jax compare {w}/no_rows.json {w}/no_rows.json", "no_rows.json: damaged evaluation (rows); wanted a"),
+    ("pregrasp_jax compare {w}/a.json {w}/odd_rows.json", "odd_rows.json: damaged evaluation (rows); wanted a file"),
+    ("pregrasp_jax compare {w}/a.json {w}/no_config.json", "no_config.json: damaged evaluation (config); wanted a"),
     ("pregrasp_jax compare {w}/a.json {w}/b.json", "cannot pair: scene_bank_hash is s in the first file and t in the"),
 ]
 
@@ -185,10 +212,12 @@ MESHES = {
     "folder": "m.obj: missing or not a file; allowed are files inside the folder",
     "link": "link.stl: link that leads out of the folder; allowed are files inside of it",
     "dangling": "m.stl: missing or not a file; allowed are files inside the folder",
+    "loop": "m.stl: missing or not a file; allowed are files inside the folder",
     "outside": "../outside.stl: listed in objects.yaml but leads out of the folder",
     "missing": "gone.stl: listed in objects.yaml but missing; allowed are names of files",
     "many_bytes": "m.stl: file of 257 MB; allowed are 256 MB, decimate it first",
     "no_target": "{f}: 5 usable 'seen' objects of which 0 can be targets; allowed are at least 5 objects and 1 target",
+    "few": "{f}: 2 usable 'seen' objects of which 2 can be targets; allowed are at least 5 objects and 1 target",
     "setting": "{f}/objects.yaml: m.stl: unknown setting 'colour'; allowed are scale, up, mass, density, friction",
 }
 TRAIN_ON = "train ci --run-dir {w}/new --assets.object-dir "
@@ -285,17 +314,64 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(world, refusal, row):
         assert part.replace("{w}", str(world)) in error
 
 
-@pytest.mark.parametrize("what", ["memory", "disk"])
-def test_a_replay_that_does_not_fit_is_refused_before_the_start(refusal, monkeypatch, what):
-    monkeypatch.setattr(resources, f"available_{what}", lambda *_: 10**5)
-    said = refusal("train ci --run-dir {w}/new --network.width 1")
-    assert f"GB of {what}" in said and "0.00 GB are free; a smaller replay.capacity helps" in said
+NEW_RUN = "train ci --run-dir {w}/new --network.width 1"
 
 
-def test_a_cache_that_cannot_be_written_is_refused_before_scenes_are_packed(world, refusal, monkeypatch):
+@pytest.mark.parametrize(
+    ("command_line", "what", "free", "advice"),
+    [
+        (
+            NEW_RUN,
+            "memory",
+            0,
+            "0.00 GB are free; allowed is more room: 1.00 GB are needed even without the replay's obs",
+        ),
+        (
+            NEW_RUN,
+            "disk",
+            0,
+            "0.00 GB are free; allowed is more room: 0.00 GB are needed even without the replay's obs",
+        ),
+        (NEW_RUN + " --replay.capacity 1000000", "memory", 2e9, "2.00 GB are free; a smaller replay.capacity helps"),
+        (NEW_RUN + " --replay.capacity 1000000", "disk", 2e9, "2.00 GB are free; a smaller replay.capacity helps"),
+        ("train resume {w}/large", "memory", 2e9, "2.00 GB are free; allowed is more room, or a new run (--init-from"),
+        ("train resume {w}/large", "disk", 2e9, "2.00 GB are free; allowed is more room, or a new run (--init-from"),
+    ],
+)
+def test_a_replay_that_does_not_fit_is_refused_before_the_start(refusal, monkeypatch, command_line, what, free, advice):
+    monkeypatch.setattr(resources, f"available_{what}", lambda *_: int(free))
+    other = {"memory": "disk", "disk": "memory"}[what]
+    monkeypatch.setattr(resources, f"available_{other}", lambda *_: 10**15)
+    said = refusal(command_line)
+    assert f"GB of {what}" in said and advice in said
+
+
+@pytest.mark.parametrize(
+    ("command_line", "file"),
+    [("pregrasp_jax scenes", "scenes/test-"), ("pregrasp_jax assets {w}/meshes/no_target", "hulls/")],
+)
+def test_a_cache_that_cannot_be_written_is_refused_before_the_work(world, refusal, monkeypatch, command_line, file):
     monkeypatch.setenv("PREGRASP_JAX_CACHE", str(world / "file" / "cache"))
-    said = refusal("pregrasp_jax scenes")
-    assert f"error: {world}/file/cache/scenes/test-" in said and f"{world}/file is not a writable folder" in said
+    monkeypatch.setattr(meshes, "ProcessPoolExecutor", None)
+    said = refusal(command_line)
+    assert f"error: {world}/file/cache/{file}" in said and f"{world}/file is not a writable folder" in said
+
+
+@pytest.mark.parametrize(
+    ("command_line", "file"),
+    [
+        ("train ci --run-dir {w}/new", "{w}/new/config.yaml"),
+        ("evaluate --policy clear --json {w}/new.json", "{w}/new.json"),
+        ("pregrasp_jax show --png {w}/new.png", "{w}/new.png"),
+        ("pregrasp_jax scenes", "/cache/scenes/test-"),
+        ("pregrasp_jax assets {w}/meshes/no_target --png {w}/new.png", "{w}/new.png"),
+    ],
+)
+def test_a_folder_without_the_right_to_write_is_refused(world, refusal, monkeypatch, command_line, file):
+    """As root, who runs these tests in a container, there is none: the system's answer is a fake."""
+    monkeypatch.setattr(os, "access", lambda _, mode: mode != os.W_OK)
+    said = refusal(command_line)
+    assert f"{file.format(w=world)}" in said and "is not a writable folder; allowed is one that is" in said
 
 
 @pytest.mark.slow

@@ -242,6 +242,30 @@ def test_policy_round_trip_from_file_folder_and_run(tmp_path):
     assert policy.read_config(tmp_path / "best" / "config.yaml") == config
 
 
+def test_policies_of_the_first_format_still_load(tmp_path):
+    """Their checksum covers the parameters alone."""
+    arrays = trees.named_leaves(make_params(5))
+    about = {"format": "pregrasp_jax policy 1", "config": "{}", "evaluation": "{}", "checksum": trees.checksum(arrays)}
+    (tmp_path / "old.safetensors").write_bytes(trees.encode(arrays, about))
+    loaded = policy.load_policy(tmp_path / "old.safetensors")
+    assert loaded.config == Config() and trees.checksum(loaded.params) == trees.checksum(make_params(5))
+    flip_byte(tmp_path / "old.safetensors", -1)
+    with pytest.raises(trees.DamagedFileError, match=r"old\.safetensors is altered \(checksum differs\)"):
+        policy.load_policy(tmp_path / "old.safetensors")
+
+
+def test_every_byte_of_a_policy_matters(tmp_path):
+    policy.save_policy(tmp_path, make_params(5), PRESETS["ci"], {"success_rate": 0.5})
+    path = tmp_path / "params.safetensors"
+    for position in range(0, path.stat().st_size, 7):
+        flip_byte(path, position)
+        with pytest.raises(ValueError) as error:
+            policy.load_policy(path)
+        assert "\n" not in str(error.value)
+        flip_byte(path, position)
+    assert policy.load_policy(path).config == PRESETS["ci"]
+
+
 def test_a_run_without_best_policy_gives_its_latest_checkpoint(tmp_path):
     checkpoints = tmp_path / "checkpoints"
     policy.write_config(tmp_path / "config.yaml", Config())

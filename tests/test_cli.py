@@ -1,6 +1,8 @@
 """Command lines: what they accept, print and write."""
 
 import json
+import os
+import platform
 import re
 import sys
 from pathlib import Path
@@ -12,16 +14,21 @@ import pytest
 import trimesh
 from fake_env import fake_env
 from PIL import Image
+from report_files import write_evaluation
 from scripts import load_script
 
+import pregrasp_jax
 from pregrasp_jax import __main__ as main_module
+from pregrasp_jax import io
 from pregrasp_jax.checkpoint import save_policy
 from pregrasp_jax.cli import commands, doctor, film, player, progress
 from pregrasp_jax.cli.evaluate import evaluate
 from pregrasp_jax.cli.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.config import PRESETS, AssetsConfig, Config, PhysicsConfig, SceneConfig, TaskConfig
 from pregrasp_jax.learning.networks import QNetwork
+from pregrasp_jax.physics import mjx_version
 from pregrasp_jax.scene.bank import SceneBank
+from pregrasp_jax.training import resources
 
 EVALUATE = load_script("evaluate")
 
@@ -180,18 +187,10 @@ def test_plain_progress_ends_with_a_line(capsys: pytest.CaptureFixture[str]) -> 
     assert captured.err == "episode 4 of 4 | success 100 % | left 0:00:00\n"
 
 
-def _evaluation_file(path: Path, policy: str, successes: list[int], **changes: Any) -> str:
-    rows = [{"scene": i, "target": "can", "success": bool(s)} for i, s in enumerate(successes)]
-    header = {"object_set": "seen", "hull_bank_hash": "h", "scene_bank_hash": "s", "camera": "orthographic"}
-    document = {"format": "pregrasp_jax evaluation 1", "policy": policy, "physics": "native", "seed": 0, "rows": rows}
-    path.write_text(json.dumps({**document, **header, **changes}))
-    return str(path)
-
-
 def test_compare_prints_and_writes(run: Any, tmp_path: Path) -> None:
-    a = _evaluation_file(tmp_path / "a.json", "mine", [1, 1, 1, 1, 1, 1, 0])
-    b = _evaluation_file(tmp_path / "b.json", "clear", [0, 0, 0, 0, 0, 0, 1])
-    code, out, _ = run(main_module.main, "compare", a, b, "--json", str(tmp_path / "c.json"))
+    a = write_evaluation(tmp_path / "a.json", "mine", [1, 1, 1, 1, 1, 1, 0])
+    b = write_evaluation(tmp_path / "b.json", "clear", [0, 0, 0, 0, 0, 0, 1])
+    code, out, _ = run(main_module.main, "compare", str(a), str(b), "--json", str(tmp_path / "c.json"))
     assert code == 0
     assert "mine" in out and "only A 6, only B 1" in out and "p = 0.125" in out
     written = json.loads((tmp_path / "c.json").read_text())
@@ -203,7 +202,81 @@ def test_doctor_names_what_a_bug_report_needs(run: Any) -> None:
     assert code == 0
     lines = dict(line.split(maxsplit=1) for line in out.splitlines())
     assert {"python", "mujoco", "jax", "cores", "NPROC", "cache", "free"} <= set(lines)
-    assert dict(doctor.describe())["engine native"] == "works"
+    found = dict(doctor.describe())
+    assert found["engine native"] == "works"
+    assert found["engine mjx"] == f"mujoco-mjx {mjx_version.SUPPORTED[0]}, supported"
+    assert re.fullmatch(r".* \(\d+\.\d\d GB, \d+\.\d\d GB free\)", found["cache"])
+
+
+def test_doctor_outlives_what_it_diagnoses(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> Any:
+        raise RuntimeError("no backend:\n  none at all")
+
+    broken = {"jax devices": (jax, "devices"), "free memory": (resources, "available_memory")}
+    broken |= {"free disk here": (Path, "cwd"), "cache": (io, "cache_dir"), "machine": (platform, "release")}
+    for owner, name in broken.values():
+        monkeypatch.setattr(owner, name, fail)
+    monkeypatch.setattr(mjx_version, "installed", lambda: "3.16.0")
+    code, _, _ = run(main_module.main, "doctor")
+    found = dict(doctor.describe())
+    assert code == 0 and found["engine native"] == "works"
+    assert {found[name] for name in broken} == {"failed (RuntimeError: no backend: none at all)"}
+    assert found["engine mjx"] == "unsupported: physics.engine = 'mjx': mujoco-mjx 3.16.0 is installed; allowed: 3.17.0"
+
+
+def test_doctor_says_where_an_error_without_words_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So jax answers JAX_PLATFORMS=cuda where it was installed for the CPU."""
+
+    def fail() -> Any:
+        raise AssertionError
+
+    monkeypatch.setattr(jax, "devices", fail)
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    found = dict(doctor.describe())
+    assert found["JAX_PLATFORMS"] == "cuda"
+    assert re.fullmatch(r"failed \(AssertionError: in test_cli\.py, line \d+\)", found["jax devices"])
+
+
+def test_doctor_measures_a_cache_that_is_being_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PREGRASP_JAX_CACHE", str(tmp_path))
+    (tmp_path / "whole.npz").write_bytes(bytes(20_000_000))
+    (tmp_path / ".gone.partial").symlink_to("nothing")
+    monkeypatch.setattr(Path, "is_file", lambda _: True)  # as it was when the folder was listed
+    assert dict(doctor.describe())["cache"].startswith(f"{tmp_path} (0.02 GB, ")
+
+
+@pytest.mark.parametrize(
+    ("cores", "nproc", "by_guard", "finding"),
+    [
+        (2, "4", True, "4, set by pregrasp_jax: enough threads for XLA"),
+        (2, "4", False, "4, set by the environment: enough threads for XLA"),
+        (8, None, False, "unset: enough threads for XLA"),
+        (2, None, False, "unset: MJX may deadlock; set NPROC=4 before Python starts"),
+        (2, "abc", False, "abc, set by the environment: MJX may deadlock; set NPROC=4 before Python starts"),
+    ],
+)
+def test_doctor_says_who_set_nproc(
+    monkeypatch: pytest.MonkeyPatch, cores: int, nproc: str | None, by_guard: bool, finding: str
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    monkeypatch.setattr(pregrasp_jax, "NPROC_BY_GUARD", by_guard, raising=False)
+    monkeypatch.delenv("NPROC")
+    if nproc:
+        monkeypatch.setenv("NPROC", nproc)
+    assert dict(doctor.describe())["NPROC"] == finding
+
+
+@pytest.mark.parametrize("nproc", ["abc", "", "2", None])
+def test_a_small_machine_is_guarded_whatever_nproc_says(monkeypatch: pytest.MonkeyPatch, nproc: str | None) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    monkeypatch.setenv("NPROC", nproc or "")
+    if nproc is None:
+        monkeypatch.delenv("NPROC")
+    with pytest.warns(RuntimeWarning, match="jax was imported before pregrasp_jax"):
+        assert not pregrasp_jax.guard_small_machine()
+    monkeypatch.delitem(sys.modules, "jax")
+    assert pregrasp_jax.guard_small_machine() and os.environ["NPROC"] == "4"
+    assert not pregrasp_jax.guard_small_machine(), "it is enough already"
 
 
 def test_assets_lists_and_draws_a_folder(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ One bad mesh never stops the rest: it becomes a `Refusal`, one line that names w
 
 import logging
 import multiprocessing
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -66,7 +67,8 @@ def load_object_dir(
         The bank of all good meshes (empty if there is none), and one refusal for every other.
 
     Raises:
-        ValueError: the folder or the set does not exist, holds no mesh, or `objects.yaml` is wrong.
+        ValueError: the folder or the set does not exist, holds no mesh, `objects.yaml` is wrong, or there is no place
+            to store what is decomposed.
     """
     folder = mesh_folder(Path(object_dir), object_set)
     jobs, refusals = _list_jobs(folder)
@@ -137,10 +139,10 @@ def _list_jobs(folder: Path) -> tuple[list[_Job], list[Refusal]]:
         raise ValueError(f"{folder}: holds no mesh; allowed are {', '.join(SUFFIXES)} files")
     jobs = []
     for path in paths:
-        if not path.resolve().is_relative_to(folder.resolve()):
-            refusals.append(Refusal(path.name, "link that leads out of the folder; allowed are files inside of it"))
-        elif not path.is_file():
+        if not path.is_file():  # first, since a link in a loop cannot be resolved
             refusals.append(Refusal(path.name, "missing or not a file; allowed are files inside the folder"))
+        elif not path.resolve().is_relative_to(folder.resolve()):
+            refusals.append(Refusal(path.name, "link that leads out of the folder; allowed are files inside of it"))
         else:
             unique = sum(other.stem == path.stem for other in paths) == 1
             jobs.append(_Job(path.stem if unique else path.name, path, listed.get(path.name, defaults)))
@@ -156,20 +158,41 @@ def _why_absent(folder: Path, name: str) -> str:
 
 
 def _results(jobs: Sequence[_Job]):
-    """Yield every job with its bank of one object, or the reason for its refusal; cached ones first."""
+    """Yield every job with its bank of one object, or the reason for its refusal; cached ones first.
+
+    Raises:
+        ValueError: something must be decomposed, and there is no place to store it.
+    """
     pending: list[tuple[_Job, Path]] = []
     for job in jobs:
-        cached = io.cache_dir() / "hulls" / f"{_cache_key(job)}.npz"
         try:
-            yield job, load_bank(cached)
-        except (OSError, ValueError):  # absent or damaged: build it again
+            cached = io.cache_dir() / "hulls" / f"{_cache_key(job)}.npz"
+        except OSError as error:
+            yield job, f"cannot be read ({error.strerror}); allowed are readable files"
+            continue
+        if bank := _load_cached(job, cached):
+            yield job, bank
+        else:
             pending.append((job, cached))
+    if pending:
+        io.refuse_unwritable(pending[0][1])
     for index, made in _decompose_all([job for job, _ in pending]):
         job, cached = pending[index]
         result = _finish(made) if isinstance(made, ConvexObject) else made
         if isinstance(result, HullBank):
             save_bank(cached, result)
         yield job, result
+
+
+def _load_cached(job: _Job, cached: Path) -> HullBank | None:
+    """Return the bank of one object, None if it is absent or damaged; the latter is a warning."""
+    if not cached.is_file():
+        return None
+    try:
+        return load_bank(cached)
+    except (OSError, ValueError):
+        warnings.warn(f"{cached} is damaged; {job.path.name} is decomposed anew", stacklevel=2)
+        return None
 
 
 def _cache_key(job: _Job) -> str:

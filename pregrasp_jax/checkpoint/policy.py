@@ -6,10 +6,12 @@ evaluation.json
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from pregrasp_jax import io
@@ -18,8 +20,11 @@ from pregrasp_jax.checkpoint.state import read_newest_arrays
 from pregrasp_jax.checkpoint.trees import DamagedFileError
 from pregrasp_jax.config import Config, from_dict, to_dict
 
-FORMAT = 1
-"""Version of the header of a policy."""
+FORMAT = "pregrasp_jax policy 2"
+"""What the header of a policy says that it is."""
+
+_FORMAT_1 = "pregrasp_jax policy 1"
+"""As the policy that ships; its checksum covers the parameters alone."""
 
 PARAMS_PREFIX = "learning/learner/target_params/"
 """Where a training state keeps what a policy needs."""
@@ -51,12 +56,8 @@ class Policy:
 def save_policy(folder: Path, params: Any, config: Config, evaluation: dict[str, Any]) -> None:
     """Write a policy. `params.safetensors` alone is complete; the two other files repeat its header for people."""
     arrays = trees.named_leaves(params)
-    metadata = {
-        "format": f"pregrasp_jax policy {FORMAT}",
-        "config": json.dumps(to_dict(config)),
-        "evaluation": json.dumps(evaluation),
-        "checksum": trees.checksum(params),
-    }
+    about = {"format": FORMAT, "config": json.dumps(to_dict(config)), "evaluation": json.dumps(evaluation)}
+    metadata = about | {"checksum": _checksum(arrays, about)}
     io.write_bytes(folder / _PARAMS, trees.encode(arrays, metadata))
     write_config(folder / "config.yaml", config)
     io.write_json(folder / "evaluation.json", evaluation)
@@ -103,19 +104,26 @@ def read_config(path: Path) -> Config:
 
 def _read_policy(path: Path) -> Policy:
     data = path.read_bytes()
-    arrays = trees.decode(data, origin=str(path))
+    arrays, metadata = trees.decode(data, origin=str(path)), trees.read_metadata(data)
+    if not {"format", "config", "evaluation", "checksum"} <= metadata.keys():
+        raise ValueError(f"{path} was not written by this package: its header names no config")
+    if metadata["format"] not in (FORMAT, _FORMAT_1):
+        raise ValueError(f"{path} was written by another version of this package: {metadata['format']}")
+    if _checksum(arrays, metadata) != metadata["checksum"]:
+        raise DamagedFileError(f"{path} is altered (checksum differs)")
     try:
-        metadata = trees.read_metadata(data)
-        config = from_dict(json.loads(metadata["config"]))
-        evaluation, expected = json.loads(metadata["evaluation"]), metadata["checksum"]
-    except (KeyError, json.JSONDecodeError):
-        raise ValueError(f"{path} was not written by this package: its header names no config") from None
+        config, evaluation = from_dict(json.loads(metadata["config"])).validate(), json.loads(metadata["evaluation"])
     except ValueError as error:
         raise ValueError(f"{path} was written by another version of this package: {error}") from None
-    params = trees.nest(arrays)
-    if trees.checksum(params) != expected:
-        raise DamagedFileError(f"{path} is altered (checksum differs)")
-    return Policy(params, config, evaluation, path)
+    return Policy(trees.nest(arrays), config, evaluation, path)
+
+
+def _checksum(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
+    """Return the checksum of parameters, config and evaluation, by the rule of the format that the header names."""
+    params = trees.checksum(arrays)
+    if metadata["format"] == _FORMAT_1:
+        return params
+    return io.content_hash(params, metadata["config"], metadata["evaluation"])
 
 
 def _policy_of_checkpoint(folder: Path, config: Config) -> Policy:

@@ -77,12 +77,14 @@ def decode(data: bytes, *, origin: str) -> dict[str, np.ndarray]:
     """Return the arrays of safetensors bytes.
 
     Raises:
-        DamagedFileError: the bytes are not whole; `origin` names them.
+        DamagedFileError: the bytes are not whole, or of a type that numpy lacks; `origin` names them.
     """
     try:
         return safetensors.numpy.load(data)
     except safetensors.SafetensorError as error:
         raise DamagedFileError(f"{origin} is damaged or not safetensors ({error})") from None
+    except KeyError as error:  # a type that numpy lacks, such as BF16
+        raise DamagedFileError(f"{origin} is damaged or not of this package (its arrays are {error.args[0]})") from None
 
 
 def read_metadata(data: bytes) -> dict[str, str]:
@@ -91,7 +93,7 @@ def read_metadata(data: bytes) -> dict[str, str]:
     A safetensors file starts with the length of its JSON header, 8 bytes little-endian.
     """
     length = int.from_bytes(data[:8], "little")
-    return json.loads(data[8 : 8 + length]).get("__metadata__", {})
+    return json.loads(data[8 : 8 + length]).get("__metadata__") or {}
 
 
 def _name(path: tuple[Any, ...]) -> str:

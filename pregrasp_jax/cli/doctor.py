@@ -1,12 +1,17 @@
 """`python -m pregrasp_jax doctor`: what this machine offers, in lines a bug report can carry."""
 
+import contextlib
 import importlib.util
 import os
 import platform
+import traceback
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import jax
 
+import pregrasp_jax
 from pregrasp_jax import io
 from pregrasp_jax.machine import versions
 from pregrasp_jax.training import resources
@@ -19,31 +24,37 @@ _OPTIONAL = {
 
 
 def describe() -> list[tuple[str, str]]:
-    """Return (name, finding) pairs."""
-    found = [(name, version) for name, version in versions().items()]
-    found += [
-        ("machine", f"{platform.machine()}, {platform.system()} {platform.release()}"),
-        ("cores", f"{_num_cores()} usable of {os.cpu_count()}"),
-        ("NPROC", _describe_guard()),
-        ("jax devices", ", ".join(f"{device.platform} {device.device_kind}" for device in jax.devices())),
-        ("engine native", _describe_native()),
-        ("engine mjx", _describe_module("mujoco.mjx")),
-    ]
-    found += [(module, f"{_describe_module(module)} ({use})") for module, use in _OPTIONAL.items()]
-    memory = resources.available_memory()
-    found += [
-        ("free memory", "unknown" if memory is None else _gigabytes(memory)),
-        ("free disk here", _gigabytes(resources.available_disk(Path.cwd()))),
-        ("cache", _describe_folder(io.cache_dir())),
-        ("compiled programs", str(os.environ.get("JAX_COMPILATION_CACHE_DIR") or io.cache_dir() / "jax")),
-    ]
-    return found
+    """Return (name, finding) pairs; a probe that fails says so, and does not keep the others from being heard."""
+    probes: dict[str, Callable[[], str]] = {
+        "machine": lambda: f"{platform.machine()}, {platform.system()} {platform.release()}",
+        "cores": lambda: f"{_num_cores()} usable of {os.cpu_count()}",
+        "NPROC": _describe_guard,
+        "JAX_PLATFORMS": lambda: os.environ.get("JAX_PLATFORMS") or "unset",
+        "jax devices": lambda: ", ".join(f"{device.platform} {device.device_kind}" for device in jax.devices()),
+        "engine native": _describe_native,
+        "engine mjx": _describe_mjx,
+        **{module: partial(_describe_module, module, use) for module, use in _OPTIONAL.items()},
+        "free memory": _describe_memory,
+        "free disk here": lambda: _gigabytes(resources.available_disk(Path.cwd())),
+        "cache": lambda: _describe_folder(io.cache_dir()),
+        "compiled programs": lambda: os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(io.cache_dir() / "jax"),
+    }
+    return [*versions().items(), *((name, _finding(probe)) for name, probe in probes.items())]
 
 
 def format_description(found: list[tuple[str, str]]) -> str:
     """Return one line per finding."""
     width = max(len(name) for name, _ in found)
     return "\n".join(f"{name:<{width}}  {finding}" for name, finding in found)
+
+
+def _finding(probe: Callable[[], str]) -> str:
+    try:
+        return probe()
+    except Exception as error:  # whatever is broken here is what the user wants to know
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        text = " ".join(str(error).split()) or f"in {Path(where.filename).name}, line {where.lineno}"
+        return f"failed ({type(error).__name__}: {text})"
 
 
 def _num_cores() -> int:
@@ -53,9 +64,11 @@ def _num_cores() -> int:
 def _describe_guard() -> str:
     """Say whether XLA has the four threads below which MJX programs deadlock."""
     value = os.environ.get("NPROC")
-    if max(_num_cores(), int(value or 0)) >= 4:
-        return f"{value or 'unset'}: enough threads for XLA"
-    return f"{value or 'unset'}: MJX may deadlock; set NPROC=4 before Python starts"
+    origin = "pregrasp_jax" if pregrasp_jax.NPROC_BY_GUARD else "the environment"
+    said = f"{value}, set by {origin}" if value else "unset"
+    if max(_num_cores(), pregrasp_jax.num_threads_asked()) >= 4:
+        return f"{said}: enough threads for XLA"
+    return f"{said}: MJX may deadlock; set NPROC=4 before Python starts"
 
 
 def _describe_native() -> str:
@@ -74,13 +87,37 @@ def _describe_native() -> str:
     )
 
 
-def _describe_module(name: str) -> str:
-    return "installed" if importlib.util.find_spec(name) else "not installed"
+def _describe_mjx() -> str:
+    try:
+        from pregrasp_jax.physics import mjx_version  # here, since importing it refuses what is not supported
+
+        mjx_version.require(mjx_version.installed())
+    except ValueError as error:
+        return f"unsupported: {error}"
+    return f"mujoco-mjx {mjx_version.installed()}, supported"
+
+
+def _describe_module(name: str, use: str) -> str:
+    return f"{'installed' if importlib.util.find_spec(name) else 'not installed'} ({use})"
+
+
+def _describe_memory() -> str:
+    memory = resources.available_memory()
+    return "unknown" if memory is None else _gigabytes(memory)
 
 
 def _describe_folder(path: Path) -> str:
-    size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) if path.is_dir() else 0
-    return f"{path} ({_gigabytes(size)})"
+    return f"{path} ({_gigabytes(_num_bytes(path))}, {_gigabytes(resources.available_disk(path))} free)"
+
+
+def _num_bytes(folder: Path) -> int:
+    """Return the bytes of all files in a folder, in which others may be writing meanwhile."""
+    size = 0
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                size += os.stat(os.path.join(parent, name)).st_size
+    return size
 
 
 def _gigabytes(size: int) -> str:

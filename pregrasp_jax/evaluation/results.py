@@ -12,11 +12,15 @@ from pregrasp_jax import io
 from pregrasp_jax.config import Config, to_dict
 from pregrasp_jax.judge import TARGET_IN_REGION
 from pregrasp_jax.machine import versions
-from pregrasp_jax.statistics import wilson_interval
+from pregrasp_jax.statistics import is_interval, is_number, wilson_interval
 from pregrasp_jax.types import REASONS
 
 FORMAT = "pregrasp_jax evaluation 1"
 """Marks an evaluation file, so that a foreign JSON is not taken for one."""
+
+_TEXTS = ("policy", "object_set", "camera", "physics", "hull_bank_hash", "scene_bank_hash")
+
+_WANTED = "wanted a file written by evaluate.py --json"
 
 GRASP_FAILED = "grasp_failed"
 """Reason of an episode whose target was in the closing region but not held; the others are `REASONS`."""
@@ -147,20 +151,44 @@ def evaluation_document(
 
 
 def load_evaluation(path: Path) -> dict[str, Any]:
-    """Read an evaluation file.
+    """Read an evaluation file that has all that comparisons and reports show.
 
     Raises:
-        ValueError: missing, not JSON, or not written by `evaluate.py --json`.
+        ValueError: missing, damaged, not JSON, or not written by `evaluate.py --json`.
     """
     try:
         document = json.loads(path.read_text())
     except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}; wanted a file written by evaluate.py --json") from None
+        raise ValueError(f"{path}: {error.strerror}; {_WANTED}") from None
     except ValueError:
-        raise ValueError(f"{path}: not JSON; wanted a file written by evaluate.py --json") from None
+        raise ValueError(f"{path}: not JSON; {_WANTED}") from None
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise ValueError(f"{path}: not an evaluation; wanted a file written by evaluate.py --json")
+        raise ValueError(f"{path}: not an evaluation; {_WANTED}")
+    if damaged := _damaged_keys(document):
+        raise ValueError(f"{path}: damaged evaluation ({', '.join(damaged)}); {_WANTED}")
     return document
+
+
+def _damaged_keys(document: dict[str, Any]) -> list[str]:
+    """Return the keys that are missing or of no use; only `config` may be missing, it is not needed to pair."""
+    interval, rows, config = document.get("success_ci95"), document.get("rows"), document.get("config", {})
+    motions = [document.get("mean_motions"), document.get("std_motions")]
+    good = {key: isinstance(document.get(key), str) for key in _TEXTS}
+    good["seed"] = isinstance(document.get("seed"), int)
+    good["episodes"] = isinstance(document.get("episodes"), int) and document["episodes"] > 0
+    good["success_rate"] = is_number(document.get("success_rate"))
+    good["success_ci95"] = is_interval(interval)
+    good["mean_motions"] = motions == [None, None] or all(map(is_number, motions))
+    good["failures"] = isinstance(document.get("failures"), dict)
+    good["rows"] = isinstance(rows, list) and len(rows) > 0 and all(map(_is_row, rows))
+    good["config"] = isinstance(config, dict) and isinstance(config.get("task", {}), dict)
+    return [key for key, is_good in good.items() if not is_good]
+
+
+def _is_row(row: Any) -> bool:
+    """Return whether an episode can be paired by scene."""
+    kinds = {"scene": int, "target": str, "success": bool}
+    return isinstance(row, dict) and all(isinstance(row.get(key), kind) for key, kind in kinds.items())
 
 
 def format_evaluation(document: dict[str, Any]) -> str:

@@ -1,15 +1,15 @@
 """What a run folder holds, read without any of the machinery that made it, so that older runs have reports too."""
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import yaml
 
 from pregrasp_jax.report.svg import Point
+from pregrasp_jax.statistics import is_interval, is_number
 
 SECONDS = "time/seconds"
 """Metric: training time, over all sessions, without start-up and compilation."""
@@ -51,16 +51,6 @@ class RunRecord:
     def last(self, metric: str) -> float | None:
         """Return the newest finite value of a metric."""
         return next((row[metric] for row in reversed(self.metrics) if is_number(row.get(metric))), None)
-
-
-def is_number(value: Any) -> TypeGuard[float]:
-    """Return whether a JSON value is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def is_interval(value: Any) -> TypeGuard[list[float]]:
-    """Return whether a JSON value is a pair of finite numbers."""
-    return isinstance(value, list) and len(value) == 2 and all(map(is_number, value))
 
 
 def read_run(path: Path) -> RunRecord:

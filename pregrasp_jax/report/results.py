@@ -8,7 +8,7 @@ from typing import Any
 from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.evaluation import load_evaluation
 from pregrasp_jax.report.markup import Markup, element
-from pregrasp_jax.report.record import RunRecord, is_number
+from pregrasp_jax.report.record import RunRecord
 from pregrasp_jax.report.svg import interval_mark
 from pregrasp_jax.statistics import compare
 
@@ -20,8 +20,6 @@ EVALUATIONS = "evaluations"
 
 _EPISODES = 100
 """Scenes of an evaluation that the report asks for, if it knows none."""
-
-_TEXTS = ("policy", "object_set", "camera", "physics", "hull_bank_hash", "scene_bank_hash")
 
 _HEADER = (
     "policy",
@@ -46,7 +44,7 @@ def load_evaluations(run: RunRecord, files: Sequence[Path] = ()) -> list[dict[st
         ValueError: one is missing, damaged, or not written by `evaluate.py --json`.
     """
     files = files or sorted((run.path / EVALUATIONS).glob("*.json"))
-    documents = [_checked(load_evaluation(file), file) for file in files]
+    documents = [load_evaluation(file) for file in files]
     return sorted(documents, key=lambda document: (document["object_set"], _rank(run, document)))
 
 
@@ -145,25 +143,3 @@ def _rank(run: RunRecord, document: dict[str, Any]) -> tuple[int, str]:
         return 0, document["camera"]
     policy = document["policy"]
     return (1 + BASELINES.index(policy), policy) if policy in BASELINES else (1 + len(BASELINES), policy)
-
-
-def _checked(document: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return an evaluation that has what the report shows.
-
-    Raises:
-        ValueError: it has not.
-    """
-    interval, rows = document.get("success_ci95"), document.get("rows")
-    motions = [document.get("mean_motions"), document.get("std_motions")]
-    good = {key: isinstance(document.get(key), str) for key in _TEXTS}
-    good["episodes"] = isinstance(document.get("episodes"), int) and document["episodes"] > 0
-    good["success_rate"] = is_number(document.get("success_rate"))
-    good["success_ci95"] = isinstance(interval, list) and len(interval) == 2 and all(map(is_number, interval))
-    good["mean_motions"] = motions == [None, None] or all(map(is_number, motions))
-    good["failures"] = isinstance(document.get("failures"), dict)
-    good["rows"] = isinstance(rows, list) and all(
-        isinstance(row, dict) and {"scene", "target", "success"} <= row.keys() for row in rows
-    )
-    if damaged := [key for key, is_good in good.items() if not is_good]:
-        raise ValueError(f"{path}: damaged evaluation ({', '.join(damaged)}); evaluate.py --json writes it anew")
-    return document

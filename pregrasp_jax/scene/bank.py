@@ -5,6 +5,7 @@ once, and train, validation and test never share one.
 """
 
 import inspect
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,7 +77,7 @@ def num_scenes(config: SceneConfig, split: Split) -> int:
 def load_or_build(
     bank: HullBank, config: SceneConfig, split: Split, *, threads: int = 0, progress: Progress | None = None
 ) -> SceneBank:
-    """Return the split's scenes from the cache, or pack them and store them there.
+    """Return the split's scenes from the cache, or pack them and store them there; a damaged file is a warning.
 
     Raises:
         ValueError: the object set cannot be packed (too few objects accepted or no eligible target), or there is
@@ -87,8 +88,8 @@ def load_or_build(
     if path.is_file():
         try:
             return load(path, digest)
-        except ValueError:
-            path.unlink()
+        except ValueError as error:
+            warnings.warn(f"{' '.join(str(error).split())}; its scenes are packed anew", stacklevel=2)
     io.refuse_unwritable(path)
     scenes = build(bank, config, split, threads=threads, progress=progress)
     save(path, scenes)

@@ -48,25 +48,40 @@ def check(state: Any, ring: Any, run_dir: Path) -> None:
     Args:
         state: shapes of everything but the ring.
         ring: shapes of the replay's observations.
-        run_dir: where checkpoints will go.
+        run_dir: where checkpoints will go; those of a resumed run are there already.
 
     Raises:
-        ValueError: too little memory or disk; one line says how much of what and which setting to change.
+        ValueError: too little memory or disk; one line says how much of what, and which setting to change if one helps.
     """
-    state_bytes, ring_bytes = num_bytes(state), num_bytes(ring)
+    state_bytes, ring_bytes, held = num_bytes(state), num_bytes(ring), _held_by_checkpoints(run_dir)
     # A resumed ring exists on the host, leaf by leaf, while it moves to the device; a saved state twice.
-    memory = 3 * state_bytes + 1.5 * ring_bytes + WORKING_MEMORY
-    disk = (KEEP + 1) * state_bytes + COMPRESSED * ring_bytes
-    _refuse_above("memory", memory, available_memory(), ring_bytes)
-    _refuse_above(f"disk at {run_dir}", disk, available_disk(run_dir), ring_bytes)
+    memory = 3 * state_bytes + WORKING_MEMORY
+    _refuse_above("memory", memory + 1.5 * ring_bytes, available_memory(), fixed=memory, resumed=held > 0)
+    # Whatever lies there already, the next state is written before the oldest one goes.
+    fixed = max((KEEP + 1) * state_bytes - held, state_bytes)
+    disk = max((KEEP + 1) * state_bytes + COMPRESSED * ring_bytes - held, state_bytes)
+    _refuse_above(f"disk at {run_dir}", disk, available_disk(run_dir), fixed=fixed, resumed=held > 0)
 
 
-def _refuse_above(what: str, needed: float, available: int | None, ring_bytes: int) -> None:
-    if available is not None and needed > available:
-        raise ValueError(
-            f"the run needs about {needed / 1e9:.2f} GB of {what}, {available / 1e9:.2f} GB are free; a smaller "
-            f"replay.capacity helps (its observations take {ring_bytes / 1e9:.2f} GB)"
-        )
+def _refuse_above(what: str, needed: float, available: int | None, *, fixed: float, resumed: bool) -> None:
+    """Refuse a need; `fixed` is what the smallest replay would leave of it, and a resumed run keeps its capacity."""
+    if available is None or needed <= available:
+        return
+    if fixed > available:
+        advice = f"allowed is more room: {fixed / 1e9:.2f} GB are needed even without the replay's observations"
+    elif resumed:
+        advice = "allowed is more room, or a new run (--init-from keeps the parameters) with a smaller replay.capacity"
+    else:
+        advice = f"a smaller replay.capacity helps (its observations take {(needed - fixed) / 1e9:.2f} GB of it)"
+    raise ValueError(
+        f"the run needs about {needed / 1e9:.2f} GB of {what}, {available / 1e9:.2f} GB are free; {advice}"
+    )
+
+
+def _held_by_checkpoints(run_dir: Path) -> int:
+    """Return the bytes of a run's checkpoints, without those that were damaged and have been set aside."""
+    files = (path for path in (run_dir / "checkpoints").rglob("*") if path.is_file())
+    return sum(path.stat().st_size for path in files if path.parent.suffix != ".damaged")
 
 
 def _free_of_machine() -> int | None:
@@ -80,4 +95,11 @@ def _free_of_control_group() -> int | None:
     limit, used = _CGROUP / "memory.max", _CGROUP / "memory.current"
     if not limit.exists() or not used.exists() or not limit.read_text().strip().isdigit():
         return None
-    return int(limit.read_text()) - int(used.read_text())
+    return int(limit.read_text()) - int(used.read_text()) + _inactive_file_cache()
+
+
+def _inactive_file_cache() -> int:
+    """Return the bytes that count as used by the control group, but are given back when they are in the way."""
+    stat = _CGROUP / "memory.stat"
+    rows = (line.split() for line in stat.read_text().splitlines()) if stat.exists() else ()
+    return next((int(row[1]) for row in rows if row[0] == "inactive_file"), 0)
