@@ -59,7 +59,8 @@ def resume(config: Config, run_dir: Path, *, console: Console | None = None) -> 
         console: told about progress.
     """
     folder = RunFolder.open(run_dir, config) if processes.is_first() else WatchedFolder(run_dir)
-    return _session(config, run_dir, folder, None, console or _console())
+    with folder:
+        return _session(config, run_dir, folder, None, console or _console())
 
 
 def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
