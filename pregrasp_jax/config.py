@@ -261,7 +261,12 @@ _CPU = Config(
     network=NetworkConfig(architecture="compact", width=0.25, initial_bias=0.5, mirror=True),
     replay=ReplayConfig(capacity=100_000, importance_steps=50_000),
     learner=LearnerConfig(
-        learning_rate=1e-3, learning_rate_steps=100_000, polyak=0.995, huber_delta=1.0, updates_per_step=2.0
+        learning_rate=1e-3,
+        final_learning_rate=2e-5,
+        learning_rate_steps=100_000,
+        polyak=0.995,
+        huber_delta=1.0,
+        updates_per_step=2.0,
     ),
     exploration=ExplorationConfig(epsilon_decay=10_000, branches=3),
     train=TrainConfig(num_envs=16, episodes=25_000, minutes=150.0, evaluate_every=2_500),
@@ -280,7 +285,7 @@ PRESETS: dict[str, Config] = {
         _CPU,
         scene=SceneConfig(train_scenes=64, validation_scenes=10, test_scenes=50),
         replay=ReplayConfig(capacity=10_000, importance_steps=2_000),
-        learner=dataclasses.replace(_CPU.learner, learning_rate_steps=4_000),
+        learner=dataclasses.replace(_CPU.learner, final_learning_rate=1e-4, learning_rate_steps=4_000),
         exploration=dataclasses.replace(_CPU.exploration, epsilon_decay=2_000),
         train=TrainConfig(num_envs=16, episodes=2_000, minutes=5.0, evaluate_every=0),
     ),
