@@ -151,8 +151,9 @@ def test_the_fingers_hold_a_can_and_not_the_air():
         ids = np.append(can, np.full(MAX_OBJECTS - 1, -1)).astype(np.int32)
         states.append(env.start(SceneParams(jnp.asarray(ids), jnp.asarray(poses), jnp.int32(0))))
     assert all(int(state.aperture) == OPEN for state in states)
-    held = jax.jit(jax.vmap(env.grasp))(jax.tree.map(lambda *x: jnp.stack(x), *states))
-    np.testing.assert_array_equal(held, [True, False])
+    grasps = jax.jit(jax.vmap(env.grasp))(jax.tree.map(lambda *x: jnp.stack(x), *states))
+    np.testing.assert_array_equal(grasps.held, [True, False])
+    assert not grasps.diverged.any() and not grasps.overflows.any()
 
 
 @pytest.mark.slow
