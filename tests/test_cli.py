@@ -158,10 +158,14 @@ def test_the_shipped_policy_has_a_name(fake_world: list[Config]) -> None:
     assert fake_world[0].network.architecture == "compact"
 
 
-def test_a_film_shows_the_episodes_that_are_counted(fake_world: list[Config]) -> None:
-    request = EvaluationConfig(policy="random", episodes=6, seed=5)
+@pytest.mark.parametrize(
+    ("policy", "ends"), [("random", {"truncated"}), ("straight", {"grasp_failed", "target_in_region"})]
+)
+def test_a_film_shows_the_episodes_that_are_counted(fake_world: list[Config], policy: str, ends: set[str]) -> None:
+    request = EvaluationConfig(policy=policy, episodes=6, seed=5)
     made = make_player(request)
     rows = run_evaluation(request, made)["rows"]
+    assert ends <= {row["reason"] for row in rows}, "or nothing would be said about how these look"
     play = film.make_play(made, seed=5)
     for row in rows:
         *pushes, last = play(row["scene"])

@@ -1,13 +1,11 @@
 """The report: its numbers and curves by hand, what is missing or damaged, and the command."""
 
 import re
-import sys
 from pathlib import Path
 
 import pytest
-from report_files import ROWS, evaluation_row, write_evaluation, write_run
+from report_files import ROWS, evaluation_row, run_main, write_evaluation, write_run
 
-from pregrasp_jax import __main__ as main_module
 from pregrasp_jax.config import PRESETS, to_dict
 from pregrasp_jax.report import build_page, load_evaluations, read_run
 from pregrasp_jax.report.charts import duration, failure_figures, learning_figures, time_figures
@@ -158,7 +156,7 @@ def test_what_is_damaged_is_one_line(run_dir: Path, monkeypatch, capsys, file: s
     else:
         (run_dir / file).parent.mkdir(exist_ok=True)
         (run_dir / file).write_text(content)
-    assert _main(monkeypatch, "report", str(run_dir), "--films", "0") == 2
+    assert run_main(monkeypatch, "report", str(run_dir), "--films", "0") == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and said in error
     assert not (run_dir / "report.html").exists()
@@ -175,15 +173,6 @@ def test_what_is_damaged_is_one_line(run_dir: Path, monkeypatch, capsys, file: s
     ],
 )
 def test_what_cannot_be_done_is_one_line(run_dir: Path, monkeypatch, capsys, arguments: list[str], said: str) -> None:
-    assert _main(monkeypatch, "report", str(run_dir), *arguments) == 2
+    assert run_main(monkeypatch, "report", str(run_dir), *arguments) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and said in error
-
-
-def _main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["program", *arguments])
-    try:
-        main_module.main()
-    except SystemExit as error:
-        return int(error.code or 0)
-    return 0

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +10,9 @@ import jax
 import numpy as np
 import pytest
 from fake_env import fake_env
-from report_files import evaluation_row, make_films, write_evaluation, write_run
+from report_files import evaluation_row, make_films, run_main, write_evaluation, write_run
 from scripts import load_script
 
-from pregrasp_jax import __main__ as main_module
 from pregrasp_jax.checkpoint import save_policy
 from pregrasp_jax.cli import demo as demo_module
 from pregrasp_jax.cli import player
@@ -52,15 +50,6 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 def _save_policy(run_dir: Path, seed: int = 0, width: float = PRESETS["ci"].network.width) -> None:
     params = QNetwork(width=width).init(jax.random.key(seed), np.zeros((1, 100, 100, 2), np.float32))
     save_policy(run_dir / "best", params["params"], PRESETS["ci"], {})
-
-
-def _main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["program", *arguments])
-    try:
-        main_module.main()
-    except SystemExit as error:
-        return int(error.code or 0)
-    return 0
 
 
 # --- the command -----------------------------------------------------------------------------------------------------
@@ -118,17 +107,17 @@ def test_a_run_with_the_name_of_a_script_plays_its_own_policy(run_dir: Path, dra
 
 def test_a_policy_of_another_network_is_one_line(run_dir: Path, drawn: list[Any], monkeypatch, capsys) -> None:
     _save_policy(run_dir, width=0.125)
-    assert _main(monkeypatch, "report", str(run_dir)) == 2
+    assert run_main(monkeypatch, "report", str(run_dir)) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and "does not fit its network" in error
 
 
 def test_a_damaged_policy_is_one_line_and_films_0_does_without(run_dir: Path, monkeypatch, capsys) -> None:
     (run_dir / "best" / "params.safetensors").write_bytes(b"damaged")
-    assert _main(monkeypatch, "report", str(run_dir)) == 2
+    assert run_main(monkeypatch, "report", str(run_dir)) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "params.safetensors" in error and "--films 0" in error
-    assert _main(monkeypatch, "report", str(run_dir), "--films", "0") == 0
+    assert run_main(monkeypatch, "report", str(run_dir), "--films", "0") == 0
 
 
 def test_an_evaluation_older_than_the_policy_is_called_outdated(run_dir: Path) -> None:
@@ -146,7 +135,7 @@ def test_an_evaluation_older_than_the_policy_is_called_outdated(run_dir: Path) -
 
 
 def test_help_says_where_the_table_comes_from(monkeypatch, capsys) -> None:
-    assert _main(monkeypatch, "report", "--help") == 0
+    assert run_main(monkeypatch, "report", "--help") == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "python evaluate.py --policy NAME --json RUN_DIR/evaluations/NAME.json" in text
 

@@ -24,7 +24,7 @@ FORMAT = "pregrasp_jax policy 2"
 """What the header of a policy says that it is."""
 
 _FORMAT_1 = "pregrasp_jax policy 1"
-"""As the policy that ships; its checksum covers the parameters alone."""
+"""Of earlier runs; its checksum covers the parameters alone."""
 
 PARAMS_PREFIX = "learning/learner/target_params/"
 """Where a training state keeps what a policy needs."""

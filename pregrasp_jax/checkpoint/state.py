@@ -125,6 +125,7 @@ def restore(folder: Path, template: Any, ring_template: Any) -> Restored:
         if restored.problems:
             partial.append(path)
             damaged[path] = restored.problems[0]
+            del restored  # gigabytes, while the next one is read
             continue
         for broken in damaged:
             _set_aside(broken)

@@ -95,7 +95,7 @@ def make_play(player: Player, seed: int) -> Callable[[int], Iterator[Decision]]:
                 break
         ending = REASONS[int(result.reason)]
         if result.reason == TARGET_IN_REGION:
-            ending = _GRASPED if grasp(state) else f"{ending}, grasp failed"
+            ending = _GRASPED if grasp(state).held else f"{ending}, grasp failed"
         yield Decision(state, None, ending)
 
     return play

@@ -11,10 +11,11 @@ from pregrasp_jax.cli.evaluate import refuse_unwritable
 from pregrasp_jax.cli.film import Decision, describe_decision, draw_tiles, make_play
 from pregrasp_jax.cli.player import EvaluationConfig, Player, make_player
 from pregrasp_jax.config import AssetsConfig
+from pregrasp_jax.evaluation import load_evaluation
 from pregrasp_jax.report import Film, RunRecord, Step, load_evaluations, read_run, write_report
 from pregrasp_jax.report.page import REPORT, kept_episodes
 from pregrasp_jax.report.record import SECONDS
-from pregrasp_jax.report.results import EVALUATIONS, of_run
+from pregrasp_jax.report.results import evaluation_files, is_of_run
 from pregrasp_jax.training.program import enable_compilation_cache
 
 FILMS, MOST_SCENES = 3, 30
@@ -52,7 +53,7 @@ def report(
         if value < lowest:
             raise ValueError(f"{name} = {value} is out of range; allowed is {lowest} and more")
     run = read_run(run_dir)
-    load_evaluations(run, evaluations)
+    load_evaluations(run, evaluations)  # a damaged one is refused now, not after minutes of playing
     refuse_unwritable(html or run_dir / REPORT)
     policy = find_policy(run) if films else None
     shown, note = film_run(run, films=films, scenes=scenes) if films else ([], "")
@@ -105,22 +106,21 @@ def write_page(
         evaluations: files; those in the run folder if empty.
         html: where the page goes; the run folder if None.
     """
-    files = evaluations or sorted((run.path / EVALUATIONS).glob("*.json"))
+    files = evaluations or evaluation_files(run)
     documents = load_evaluations(run, files)
     try:
         policy = policy or find_policy(run)
     except ValueError:
         return write_report(run, documents, films, films_note=note, path=html)
     saved = policy.origin.stat().st_mtime
+    older = [file for file in files if file.stat().st_mtime < saved]
     return write_report(
         run,
         documents,
         films,
         films_note=note,
         policy=checksum(policy.params),
-        outdated=[
-            file.name for file in files if file.stat().st_mtime < saved and of_run(run, load_evaluations(run, [file]))
-        ],
+        outdated=[file.name for file in older if is_of_run(run, load_evaluation(file))],
         path=html,
     )
 

@@ -34,6 +34,11 @@ _HEADER = (
 )
 
 
+def evaluation_files(run: RunRecord) -> list[Path]:
+    """Return the evaluations that lie in the folder of a run."""
+    return sorted((run.path / EVALUATIONS).glob("*.json"))
+
+
 def load_evaluations(run: RunRecord, files: Sequence[Path] = ()) -> list[dict[str, Any]]:
     """Read evaluation files, by default those in the `evaluations` folder of the run.
 
@@ -43,8 +48,7 @@ def load_evaluations(run: RunRecord, files: Sequence[Path] = ()) -> list[dict[st
     Raises:
         ValueError: one is missing, damaged, or not written by `evaluate.py --json`.
     """
-    files = files or sorted((run.path / EVALUATIONS).glob("*.json"))
-    documents = [load_evaluation(file) for file in files]
+    documents = [load_evaluation(file) for file in files or evaluation_files(run)]
     return sorted(documents, key=lambda document: (document["object_set"], _rank(run, document)))
 
 

@@ -97,14 +97,15 @@ class RunFolder:
                 f"run {path} cannot be resumed with a changed configuration ({'; '.join(refused)}); allowed to change: "
                 f"{', '.join(EXTENDABLE)}; --init-from starts a new run from its parameters"
             )
-        folder = cls(path, _locked(path))
+        folder = WatchedFolder(path)
         if not folder.has_checkpoint and (folder.best.exists() or folder.metrics.exists()):
             raise ValueError(
                 f"run {path} has lost its checkpoints; allowed is a run with one in {folder.checkpoints}; --init-from "
                 "starts a new run from its best policy"
             )
+        lock = _locked(path)
         io.sweep(path)
-        return folder
+        return cls(path, lock)
 
     def __enter__(self) -> "RunFolder":
         """Keep the lock."""

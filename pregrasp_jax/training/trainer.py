@@ -164,11 +164,11 @@ class Trainer:
         progress = self.progress
         if progress.share_done(self.config) >= 1.0 and progress.evaluated_at == progress.env_steps:
             return "the run is complete; a higher --train.episodes or --train.minutes extends it"
+        start = time.perf_counter()
         with announced_compilation(self.console.say):
-            program, seconds = self.program.compile(self.state)
-            start = time.perf_counter()
+            program, _ = self.program.compile(self.state)
             self.compile_evaluation(self._average())
-            self._compiled_in = seconds + time.perf_counter() - start
+        self._compiled_in = time.perf_counter() - start
         self.console.start()
         while processes.agreed(progress.share_done(self.config) < 1.0):
             if processes.agreed(stop()):
