@@ -1,12 +1,14 @@
 """Grasp every eligible object at the palm under six yaws; prints one JSON object.
 
-    python benchmarks/grasp.py [--object-set seen] [--object-dir DIR]
+    python benchmarks/grasp.py [--object-set seen] [--object-dir DIR] [--scatter] [--like-mjx]
 
 The object stands alone against the palm of the open hand, centred between the fingers, as a perfect push would
-leave it. The fingers close with constant force, lift 0.2 m and hold 5 s.
+leave it. The fingers close with constant force, lift 0.2 m and hold 5 s. `--scatter` moves it away at random as real
+pushes do, `--like-mjx` simulates with the hulls and options of the `mjx` engine.
 """
 
 import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
+from pregrasp_jax.physics import mjx_version  # noqa: F401  (imports MJX without its print about Warp)
 
 # isort: split
 import argparse
@@ -19,6 +21,8 @@ import numpy as np
 
 from pregrasp_jax.config import PRESETS, AssetsConfig
 from pregrasp_jax.env import Env, make_env
+from pregrasp_jax.physics import native
+from pregrasp_jax.physics.mjx_model import make_reference_model
 from pregrasp_jax.robot import model as robot
 from pregrasp_jax.robot.closing_region import closing_region_bounds
 from pregrasp_jax.scene.model import parking_poses
@@ -28,9 +32,12 @@ NUM_YAWS = 6
 GAP = 0.001
 """m between palm and object."""
 
+SCATTER = (0.010, 0.008)
+"""m; how far scattered objects stand before the palm and, either way, beside its middle, at most."""
 
-def scene_at_palm(env: Env, obj: int, yaw: float) -> SceneParams:
-    """Return a scene of one object that stands against the palm of the hand at the start pose."""
+
+def scene_at_palm(env: Env, obj: int, yaw: float, offset: np.ndarray) -> SceneParams:
+    """Return a scene of one object at an offset [2] m from the palm of the hand at the start pose."""
     hulls = np.asarray(env.bank.object_hulls[obj])
     points = np.asarray(env.bank.full.vertices)[hulls[hulls >= 0]].reshape(-1, 3)[:, :2]
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
@@ -39,7 +46,7 @@ def scene_at_palm(env: Env, obj: int, yaw: float) -> SceneParams:
     x = robot.START_POSE[0] + palm + GAP - points[:, 0].min()
     y = -(points[:, 1].min() + points[:, 1].max()) / 2
     poses = parking_poses()
-    poses[0] = [x, y, 0, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+    poses[0] = [x + offset[0], y + offset[1], 0, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
     object_ids = np.full(MAX_OBJECTS, -1)
     object_ids[0] = obj
     return SceneParams(jnp.asarray(object_ids), jnp.asarray(poses, jnp.float32), jnp.int32(0))
@@ -50,12 +57,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--object-set", choices=["seen", "unseen"], default="seen", help="which objects")
     parser.add_argument("--object-dir", help="folder of meshes instead of the built-in catalogue")
+    parser.add_argument("--scatter", action="store_true", help="offsets of up to 1 cm and 8 mm instead of none")
+    parser.add_argument("--like-mjx", action="store_true", help="hulls and options of the mjx engine")
     arguments = parser.parse_args()
     assets = AssetsConfig(object_dir=arguments.object_dir, object_set=arguments.object_set)
     config = dataclasses.replace(PRESETS["ci"], assets=assets)
     env = make_env(config, split="test")
+    if arguments.like_mjx:
+        env = dataclasses.replace(env, engine=native.make_engine(env.bank, model=make_reference_model(env.bank)))
     objects = [int(i) for i in np.flatnonzero(np.asarray(env.bank.eligible))]
-    scenes = [scene_at_palm(env, i, yaw) for i in objects for yaw in np.pi / NUM_YAWS * np.arange(NUM_YAWS)]
+    cases = [(i, yaw) for i in objects for yaw in np.pi / NUM_YAWS * np.arange(NUM_YAWS)]
+    forward, aside = SCATTER if arguments.scatter else (0.0, 0.0)
+    offsets = np.random.default_rng(0).uniform((0, -aside), (forward, aside), (len(cases), 2))
+    scenes = [scene_at_palm(env, *case, offset) for case, offset in zip(cases, offsets, strict=True)]
 
     def attempt(scene: SceneParams) -> jax.Array:
         state: EnvState = env.start(scene)

@@ -87,10 +87,8 @@ class Pair(NamedTuple):
         return bool(np.abs(errors).max() < EXACT)
 
 
-def touching_pairs(
-    model: MjxSlotModel, oracle: CoarseModel, contacts_of: Callable[..., Any], scenes: SceneBank, num_states: int
-) -> list[Pair]:
-    """Return all pairs that touch in random states: packed and pressed together, or scattered around the arm."""
+def random_states(model: MjxSlotModel, scenes: SceneBank, num_states: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return object ids [S, 8] and qpos [S, nq]: packed and pressed together, or scattered around the arm, in turn."""
     data = mujoco.MjData(model.mj_model)
     robot.set_home(model.mj_model, data)
     rng = np.random.default_rng(0)
@@ -102,6 +100,14 @@ def touching_pairs(
         disturb = around_the_arm if row % 2 else shaken
         poses = np.where((object_ids[row] >= 0)[:, None], disturb(scenes.poses[i], rng), parking_poses())
         qpos[row, model.qpos_ids] = poses / np.where(np.arange(7) < 3, 1, np.linalg.norm(poses[:, 3:], axis=1)[:, None])
+    return object_ids, qpos
+
+
+def touching_pairs(
+    model: MjxSlotModel, oracle: CoarseModel, contacts_of: Callable[..., Any], scenes: SceneBank, num_states: int
+) -> list[Pair]:
+    """Return all pairs that touch in `random_states`."""
+    object_ids, qpos = random_states(model, scenes, num_states)
     (geom, dist, normal, *parameters), counts = jax.tree.map(
         np.asarray, contacts_of(object_ids, jnp.asarray(qpos, jnp.float32))
     )

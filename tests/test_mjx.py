@@ -1,30 +1,20 @@
-"""The `mjx` engine against C MuJoCo on the same hulls and options, and against exact geometry."""
+"""Pushes of the `mjx` engine against C MuJoCo on the same hulls and options; batches, guards and slots."""
 
 import dataclasses
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
-from mjx_contacts import ALIKE, AMPLE, UNIQUE, Pair, make_contacts_of, touching_pairs
+from mjx_contacts import AMPLE
 from mjx_oracle import CoarseModel
-from mujoco import mjx as mujoco_mjx
 
 from pregrasp_jax import primitives
 from pregrasp_jax.assets.catalogue import builtin_bank
-from pregrasp_jax.config import SceneConfig
 from pregrasp_jax.physics import mjx, mjx_model
-from pregrasp_jax.physics.hull_collision import ContactCounts, Limits
 from pregrasp_jax.robot import model as robot
-from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.types import CLOSED, MAX_HULLS, MAX_OBJECTS, OPEN, SceneParams
-
-ROOT = Path(__file__).parent.parent
-NUM_STATES = 100
-"""The benchmark mjx_agreement.py has 200."""
 
 NUM_SLOTS = 3
 SCENES = ((0, 3, 1), (13, 8, -1))
@@ -50,118 +40,6 @@ def model(bank):
 @pytest.fixture(scope="module")
 def oracle(bank):
     return CoarseModel(bank)
-
-
-def test_c_gets_the_options_of_mjx(model, oracle):
-    for name in ("cone", "impratio", "solver", "iterations", "ls_iterations", "jacobian", "integrator", "timestep"):
-        assert getattr(oracle.model.opt, name) == getattr(model.mj_model.opt, name), name
-    damped = mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    assert oracle.model.opt.disableflags & damped == model.mj_model.opt.disableflags & damped
-    assert set(oracle.model.geom_condim) == set(model.mj_model.geom_condim) == {3}
-
-
-@pytest.fixture(scope="module")
-def pairs(bank, model, oracle) -> list[Pair]:
-    scenes = scene_bank.load_or_build(bank, SceneConfig(test_scenes=3), "test")
-    return touching_pairs(model, oracle, make_contacts_of(model), scenes, NUM_STATES)
-
-
-def solid(pairs) -> list[Pair]:
-    """Return pairs of hulls and boxes."""
-    return [pair for pair in pairs if pair.normal is not None]
-
-
-def test_the_same_pairs_touch(pairs):
-    """All pairs that C finds deeper than 10 um, and none that it does not: no absent hull, no parked slot."""
-    kinds = {"table": 0, "hulls": 0, "box": 0, "capsule": 0}
-    for pair in pairs:
-        kinds[pair.kind] += 1
-        if (pair.ours is None) != (pair.reference is None):
-            assert max(touch.dist for touch in pair[2:4] if touch) > -1e-5, pair
-    assert min(kinds[kind] for kind in ("table", "hulls", "box")) > NUM_STATES
-    assert kinds["capsule"] > NUM_STATES / 8
-
-
-def test_contacts_with_the_table_agree_with_c(pairs):
-    for pair in pairs:
-        if pair.kind == "table" and pair.ours and pair.reference:
-            assert pair.ours.dist == pytest.approx(pair.reference.dist, abs=1e-6)
-            np.testing.assert_allclose(pair.ours.normal, pair.reference.normal, atol=1e-6)
-
-
-def test_contacts_with_capsules_agree_with_c(pairs):
-    """With `mj_geomDistance` always, and with C's contacts where those do (48 of 56 in 200 states); normals too."""
-    both = [pair for pair in pairs if pair.kind == "capsule" and pair.ours and pair.reference]
-    for pair in both:
-        assert pair.ours.dist == pytest.approx(-pair.least, abs=2e-5), pair
-    exact = [pair for pair in both if pair.reference_is_exact]
-    assert len(exact) > 0.8 * len(both)
-    for pair in exact:
-        assert pair.ours.normal @ pair.reference.normal > np.cos(ALIKE), pair
-
-
-def test_the_least_translation_is_exact(pairs):
-    """Distance and normal against the Minkowski difference: 20 um, of which 10 um are the preference for faces."""
-    for pair in solid(pairs):
-        if pair.ours:
-            assert pair.ours.dist == pytest.approx(-pair.least, abs=2e-5), pair
-            assert pair.along == pytest.approx(pair.least, abs=2e-5), pair
-
-
-def test_contacts_of_hulls_agree_with_c_where_c_is_exact(pairs):
-    """C stops before the least translation in some pairs, by up to 1 mm; in the others we agree."""
-    both = [pair for pair in solid(pairs) if pair.ours and pair.reference]
-    error = np.array([abs(pair.ours.dist - pair.reference.dist) for pair in both])
-    exact = np.array([pair.reference_is_exact for pair in both])
-    assert np.percentile(error, 50) < 1e-6
-    assert np.percentile(error, 90) < 1e-4
-    assert exact.mean() > 0.5
-    assert error[exact].max() < 2e-5
-
-
-def test_the_normal_is_that_of_the_least_translation_where_there_is_one(pairs):
-    """Within 1 degree of the exact one, and of C's where C is exact, unless another way out is within 40 um.
-
-    In 200 states C's normal is elsewhere in 255 of 1032 pairs: in 253 of them C is not exact (its distance is short by
-    up to 0.7 mm, or moving along its normal does not part the two), the other 2 are ties.
-    """
-    unique = [pair for pair in solid(pairs) if pair.ours and pair.margin > UNIQUE]
-    exact = [pair for pair in unique if pair.reference and pair.reference_is_exact]
-    assert len(unique) > 0.7 * len(solid(pairs))
-    assert len(exact) > 0.5 * len(unique)
-    for pair in unique:
-        assert pair.ours.normal @ pair.normal > np.cos(ALIKE), pair
-    for pair in exact:
-        assert pair.ours.normal @ pair.reference.normal > np.cos(ALIKE), pair
-
-
-def test_contacts_mix_friction_and_softness_as_c_does(pairs):
-    for pair in pairs:
-        if pair.ours and pair.reference:
-            np.testing.assert_allclose(pair.ours.parameters, pair.reference.parameters, rtol=1e-6)
-
-
-def test_a_slot_has_the_constants_of_a_separately_filled_model(model, oracle):
-    """Everything that differs between objects, with eight of them at once; the compiled median object is a decoy."""
-    object_ids = np.array([16, 3, -1, 13, 5, 0, 8, 6])
-    oracle.fill(object_ids, parking_poses())
-    filled, hull_ids = mjx_model.fill_slots(model, jnp.asarray(object_ids))
-    for names, ours, theirs in (
-        (mjx_model.BODY_FIELDS, model.body_ids, oracle.slots.slot_body_ids),
-        (mjx_model.DOF_FIELDS, model.dof_ids, oracle.slots.slot_dof_ids),
-        (("geom_friction",), model.geom_ids, oracle.slots.slot_geom_ids),
-    ):
-        for name in names:
-            expected = getattr(oracle.model, name)[theirs]
-            np.testing.assert_allclose(getattr(filled, name)[ours], expected, rtol=1e-5, atol=1e-9, err_msg=name)
-    compiled = model.mj_model.body_invweight0[model.body_ids]
-    assert np.abs(filled.body_invweight0[model.body_ids] / compiled - 1).max() > 0.5
-    present = np.asarray(hull_ids)[model.geom_ids] >= 0
-    np.testing.assert_array_equal(present, oracle.model.geom_contype[oracle.slots.slot_geom_ids] > 0)
-    robot_bodies = np.setdiff1d(np.arange(model.mj_model.nbody), model.body_ids)
-    np.testing.assert_array_equal(
-        filled.body_invweight0[robot_bodies], model.mj_model.body_invweight0[robot_bodies].astype(np.float32)
-    )
 
 
 @pytest.fixture(scope="module")
@@ -307,22 +185,6 @@ def test_only_the_scene_that_diverges_ends(plans, pushed):
 def test_one_trace_serves_all_objects(pushed):
     """Runs last of those that use the fixture: batches of other objects and plans did not trace again."""
     assert len(pushed[1]) == 1
-
-
-def test_what_is_dropped_is_counted(model):
-    """A step that had more pairs or contacts than fit is counted, one at the limit is not."""
-    limits = Limits(max_hull_pairs=2, max_robot_pairs=2, max_contact_points=4)
-    small = dataclasses.replace(model, limits=limits)
-    engine_state = mjx.MjxState(
-        *(jnp.zeros(model.mj_model.nq), jnp.zeros(model.mj_model.nv), jnp.zeros(model.mj_model.nv)),
-        *(jnp.full(MAX_OBJECTS, -1), jnp.array(False), *[jnp.int32(0)] * 5),
-    )
-    data = mujoco_mjx.make_data(model.mjx_model)
-    for hulls, hand, contacts, pair_overflows, contact_overflows in ((2, 2, 4, 0, 0), (3, 0, 4, 1, 0), (0, 3, 5, 1, 1)):
-        counts = ContactCounts(jnp.int32(hulls), jnp.int32(hand), jnp.int32(contacts), jnp.float32(0))
-        state = mjx.guarded(small, engine_state, data, counts)
-        assert (int(state.pair_overflows), int(state.contact_overflows)) == (pair_overflows, contact_overflows)
-        assert (int(state.max_hull_pairs), int(state.max_contacts)) == (hulls, contacts)
 
 
 def test_a_scene_with_more_objects_than_slots_is_marked(bank, engine):

@@ -58,6 +58,6 @@ def test_warp_says_what_is_missing(monkeypatch, bank, installed, platform, said)
 
 def test_nothing_is_printed_about_warp():
     """MJX does when it is imported, which would spoil the JSON of the benchmarks."""
-    code = "from pregrasp_jax.physics import mjx"
+    code = "from pregrasp_jax.physics import mjx_model, mjx"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert run.stdout == ""
