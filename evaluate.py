@@ -46,7 +46,7 @@ class Arguments:
     seed: int = 0
     """Seed of the policy's own randomness; scenes, yaws and targets are fixed."""
     num_envs: int = 0
-    """Scenes side by side, 0 chooses; results do not depend on it."""
+    """Scenes side by side, 0 chooses; with `native` results do not depend on it."""
     json: Path | None = None
     """Write the result here; `python -m pregrasp_jax compare A.json B.json` pairs two of them."""
     video: Path | None = None

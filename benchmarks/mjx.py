@@ -84,7 +84,7 @@ def measure_ours(
     run = jax.jit(jax.vmap(engine.run))
     result = measure(run, (state, ctrl, num_ctrl), num_scenes * rows * SUBSTEPS)
     after = run(state, ctrl, num_ctrl)
-    overflows = int(jnp.sum(after.pair_overflows + after.contact_overflows))
+    overflows = int(jnp.sum(after.overflows))
     return {
         "engine": "mjx",
         "scenes": num_scenes,
@@ -121,7 +121,8 @@ def measure_stock(bank: HullBank, num_scenes: int, rows: int, *, objects: int) -
     def run(d: Any) -> Any:
         return jax.lax.fori_loop(0, steps, lambda _, d: stock_mjx.step(m, d), d)
 
-    result = measure(jax.jit(jax.vmap(run)), (batch,), num_scenes * steps)
+    with jax.default_matmul_precision("highest"):  # as our engine does
+        result = measure(jax.jit(jax.vmap(run)), (batch,), num_scenes * steps)
     return {"engine": "stock", "scenes": num_scenes, "objects": objects, "hulls": 1, **result}
 
 

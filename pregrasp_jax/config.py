@@ -72,7 +72,7 @@ class PhysicsConfig:
     """Which engine steps the scenes."""
 
     engine: Engine = "native"
-    """`native`: MuJoCo's C engine on CPU threads; `mjx`: one XLA program; `warp`: MJX-Warp on NVIDIA GPUs."""
+    """`native`: MuJoCo's C engine on CPU threads; `mjx`: one XLA program; `warp`: says what it lacks."""
     threads: int = 0
     """Threads of the native engine; 0 takes every core. Results do not depend on it."""
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mjx_oracle import CoarseModel, deepest, margin_of_the_first, overlap_along, ways_out
+from mjx_oracle import CoarseModel, deepest, margin_of_the_first, outside_of, overlap_along, ways_out
 from mujoco import mjx as mujoco_mjx
 
 from pregrasp_jax.physics import mjx_model
@@ -42,7 +42,7 @@ def make_contacts_of(model: MjxSlotModel) -> Callable[..., Any]:
             data, counts = collide(m, data, model.hulls, hull_ids, model.limits)
         contact = data._impl.contact
         parameters = contact.friction, contact.solref, contact.solimp
-        return (contact.geom, contact.dist, contact.frame[:, 0], *parameters), counts
+        return (contact.geom, contact.dist, contact.pos, contact.frame[:, 0], *parameters), counts
 
     return jax.jit(jax.vmap(contacts_of_one))
 
@@ -67,7 +67,8 @@ class Pair(NamedTuple):
 
     `least` is the least translation that parts the two, `normal` its direction and `margin` by how much the next one
     is longer that is more than `ALIKE` away; `along` is the translation along our normal and `reference_along` that
-    along C's. None for planes, and for capsules, of which only `least` is known.
+    along C's; `outside` is how far our contact lies outside of the two. None for planes, and for capsules, of which
+    only `least` is known.
     """
 
     kind: str
@@ -79,6 +80,7 @@ class Pair(NamedTuple):
     margin: Any = None
     along: Any = None
     reference_along: Any = None
+    outside: Any = None
 
     @property
     def reference_is_exact(self) -> bool:
@@ -108,7 +110,7 @@ def touching_pairs(
 ) -> list[Pair]:
     """Return all pairs that touch in `random_states`."""
     object_ids, qpos = random_states(model, scenes, num_states)
-    (geom, dist, normal, *parameters), counts = jax.tree.map(
+    (geom, dist, pos, normal, *parameters), counts = jax.tree.map(
         np.asarray, contacts_of(object_ids, jnp.asarray(qpos, jnp.float32))
     )
     assert counts.hull_pairs.max() <= AMPLE.max_hull_pairs
@@ -120,7 +122,8 @@ def touching_pairs(
         state = oracle.fill(object_ids[s], qpos[s, model.qpos_ids])
         reference = oracle.touches(state)
         mixed = np.concatenate([values[s] for values in parameters], axis=1)
-        ours = deepest([(*names[geom[s, k]], dist[s, k], normal[s, k], mixed[k]) for k in np.flatnonzero(dist[s] < 0)])
+        touching = np.flatnonzero(dist[s] < 0)
+        ours = deepest([(*names[geom[s, k]], dist[s, k], pos[s, k], normal[s, k], mixed[k]) for k in touching])
         found += [describe(oracle, state, key, reference.get(key), ours.get(key)) for key in reference | ours]
     return found
 
@@ -136,4 +139,5 @@ def describe(oracle, state, names, reference, ours) -> Pair:
     along, reference_along = (overlap_along(a, b, touch.normal) if touch else None for touch in (ours, reference))
     depths, normals = ways_out(a, b)
     margin = margin_of_the_first(depths, normals, ALIKE)
-    return Pair(kind, names, reference, ours, depths[0], normals[0], margin, along, reference_along)
+    outside = max(outside_of(a, ours.pos), outside_of(b, ours.pos)) if ours else None
+    return Pair(kind, names, reference, ours, depths[0], normals[0], margin, along, reference_along, outside)

@@ -18,6 +18,7 @@ class Touch(NamedTuple):
     """The deepest contact of two geoms; the normal points from the first name to the second."""
 
     dist: float
+    pos: np.ndarray
     normal: np.ndarray
     parameters: np.ndarray
 
@@ -47,7 +48,7 @@ class CoarseModel:
         for contact in data.contact[: data.ncon]:
             names = [self.model.geom(g).name for g in contact.geom]
             parameters = np.concatenate([contact.friction, contact.solref, contact.solimp])
-            found.append((*names, contact.dist, contact.frame[:3], parameters))
+            found.append((*names, contact.dist, contact.pos, contact.frame[:3], parameters))
         return deepest(found)
 
     def push(self, data: mujoco.MjData, ctrl: np.ndarray, num_ctrl: int) -> np.ndarray:
@@ -76,13 +77,14 @@ class CoarseModel:
 
 
 def deepest(contacts: list[tuple]) -> dict[tuple[str, str], Touch]:
-    """Return the deepest of contacts (name, name, dist, normal, parameters) for each pair of names, in order."""
+    """Return the deepest of contacts (name, name, dist, pos, normal, parameters) for each pair of names, in order."""
     touches: dict[tuple[str, str], Touch] = {}
-    for first, second, dist, normal, parameters in contacts:
+    for first, second, dist, pos, normal, parameters in contacts:
         swap = first > second
         key = (second, first) if swap else (first, second)
         if key not in touches or dist < touches[key].dist:
-            touches[key] = Touch(float(dist), (-1 if swap else 1) * np.array(normal), np.array(parameters))
+            outward = (-1 if swap else 1) * np.array(normal)
+            touches[key] = Touch(float(dist), np.array(pos), outward, np.array(parameters))
     return touches
 
 
@@ -111,3 +113,9 @@ def margin_of_the_first(depths: np.ndarray, normals: np.ndarray, angle: float) -
 def overlap_along(a: np.ndarray, b: np.ndarray, normal: np.ndarray) -> float:
     """Return how far a reaches into b along the normal from a to b."""
     return float((a @ normal).max() - (b @ normal).min())
+
+
+def outside_of(points: np.ndarray, position: np.ndarray) -> float:
+    """Return how far a position [3] lies outside of the hull of points [n, 3]; negative inside."""
+    faces = ConvexHull(points).equations
+    return float((faces[:, :3] @ position + faces[:, 3]).max())

@@ -28,7 +28,7 @@ from pregrasp_jax.config import PRESETS, AssetsConfig, Config, PhysicsConfig, Sc
 from pregrasp_jax.learning.networks import QNetwork
 from pregrasp_jax.physics import mjx_version
 from pregrasp_jax.scene.bank import SceneBank
-from pregrasp_jax.training import resources
+from pregrasp_jax.training import program, resources
 
 EVALUATE = load_script("evaluate")
 
@@ -212,6 +212,18 @@ def test_doctor_names_what_a_bug_report_needs(run: Any) -> None:
     assert re.fullmatch(r".* \(\d+\.\d\d GB, \d+\.\d\d GB free\)", found["cache"])
 
 
+def test_the_compilation_cache_has_an_off_switch(monkeypatch: pytest.MonkeyPatch) -> None:
+    changed: list[tuple[str, Any]] = []
+    monkeypatch.setattr(program.jax.config, "update", lambda *change: changed.append(change))
+    program.enable_compilation_cache()
+    assert not changed, "these tests have chosen a folder, which stays"
+    assert dict(doctor.describe())["compiled programs"] == jax.config.values["jax_compilation_cache_dir"]
+    monkeypatch.setenv(program.CACHE_SWITCH, "0")
+    program.enable_compilation_cache()
+    assert changed == [("jax_enable_compilation_cache", False)], "whatever folder is set"
+    assert dict(doctor.describe())["compiled programs"] == "not kept (PREGRASP_JAX_COMPILATION_CACHE=0)"
+
+
 def test_doctor_outlives_what_it_diagnoses(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: Any) -> Any:
         raise RuntimeError("no backend:\n  none at all")
@@ -225,7 +237,7 @@ def test_doctor_outlives_what_it_diagnoses(run: Any, monkeypatch: pytest.MonkeyP
     found = dict(doctor.describe())
     assert code == 0 and found["engine native"] == "works"
     assert {found[name] for name in broken} == {"failed (RuntimeError: no backend: none at all)"}
-    assert found["engine mjx"] == "unsupported: physics.engine = 'mjx': mujoco-mjx 3.16.0 is installed; allowed: 3.17.0"
+    assert "3.16.0 is installed; allowed: 3.17.0 (pip install mujoco-mjx==3.17.0)" in found["engine mjx"]
 
 
 def test_doctor_says_where_an_error_without_words_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from mujoco import mjx as mujoco_mjx
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import SceneConfig
 from pregrasp_jax.physics import mjx, mjx_model
+from pregrasp_jax.physics.base import MAX_PENETRATION
 from pregrasp_jax.physics.hull_collision import ContactCounts, Limits
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses
@@ -88,6 +89,7 @@ def test_contacts_with_the_table_agree_with_c(pairs):
         if pair.kind == "table" and pair.ours and pair.reference:
             assert pair.ours.dist == pytest.approx(pair.reference.dist, abs=1e-6)
             np.testing.assert_allclose(pair.ours.normal, pair.reference.normal, atol=1e-6)
+            assert pair.ours.pos[2] == pytest.approx(pair.reference.pos[2], abs=1e-6), "half way between the two"
 
 
 def test_contacts_with_capsules_agree_with_c(pairs):
@@ -134,6 +136,17 @@ def test_the_normal_is_that_of_the_least_translation_where_there_is_one(pairs):
         assert pair.ours.normal @ pair.normal > np.cos(ALIKE), pair
     for pair in exact:
         assert pair.ours.normal @ pair.reference.normal > np.cos(ALIKE), pair
+
+
+def test_contacts_lie_half_way_between_the_surfaces(pairs):
+    """Within the overlap of the two unless they have diverged; where C is exact as far along the normal as its own."""
+    both = [pair for pair in solid(pairs) if pair.ours]
+    for pair in both:
+        assert pair.outside < 5e-5 or pair.ours.dist < -MAX_PENETRATION, pair
+    exact = [pair for pair in both if pair.reference and pair.reference_is_exact and pair.margin > UNIQUE]
+    assert len(exact) > 0.3 * len(both)
+    for pair in exact:
+        assert (pair.ours.pos - pair.reference.pos) @ pair.reference.normal == pytest.approx(0, abs=2e-5), pair
 
 
 def test_contacts_mix_friction_and_softness_as_c_does(pairs):
@@ -235,16 +248,16 @@ def distinct(contacts) -> np.ndarray:
 
 
 def test_what_is_dropped_is_counted(model):
-    """A step that had more pairs or contacts than fit is counted, one at the limit is not."""
+    """A step that had more pairs or contacts than fit is counted, once, and one at the limit is not."""
     limits = Limits(max_hull_pairs=2, max_robot_pairs=2, max_contact_points=4)
     small = dataclasses.replace(model, limits=limits)
     engine_state = mjx.MjxState(
         *(jnp.zeros(model.mj_model.nq), jnp.zeros(model.mj_model.nv), jnp.zeros(model.mj_model.nv)),
-        *(jnp.full(MAX_OBJECTS, -1), jnp.array(False), *[jnp.int32(0)] * 5),
+        *(jnp.full(MAX_OBJECTS, -1), jnp.array(False), *[jnp.int32(0)] * 4),
     )
     data = mujoco_mjx.make_data(model.mjx_model)
-    for hulls, hand, contacts, pair_overflows, contact_overflows in ((2, 2, 4, 0, 0), (3, 0, 4, 1, 0), (0, 3, 5, 1, 1)):
+    for hulls, hand, contacts, overflows in ((2, 2, 4, 0), (3, 0, 4, 1), (0, 3, 4, 1), (0, 0, 5, 1), (0, 3, 5, 1)):
         counts = ContactCounts(jnp.int32(hulls), jnp.int32(hand), jnp.int32(contacts), jnp.float32(0))
         state = mjx.guarded(small, engine_state, data, counts)
-        assert (int(state.pair_overflows), int(state.contact_overflows)) == (pair_overflows, contact_overflows)
+        assert int(state.overflows) == overflows
         assert (int(state.max_hull_pairs), int(state.max_contacts)) == (hulls, contacts)

@@ -15,6 +15,7 @@ import pregrasp_jax
 from pregrasp_jax import io
 from pregrasp_jax.machine import versions
 from pregrasp_jax.training import resources
+from pregrasp_jax.training.program import CACHE_SWITCH, compilation_cache_dir
 
 _OPTIONAL = {
     "warp": "engine warp",
@@ -37,7 +38,7 @@ def describe() -> list[tuple[str, str]]:
         "free memory": _describe_memory,
         "free disk here": lambda: _gigabytes(resources.available_disk(Path.cwd())),
         "cache": lambda: _describe_folder(io.cache_dir()),
-        "compiled programs": lambda: os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(io.cache_dir() / "jax"),
+        "compiled programs": lambda: str(compilation_cache_dir() or f"not kept ({CACHE_SWITCH}=0)"),
     }
     return [*versions().items(), *((name, _finding(probe)) for name, probe in probes.items())]
 

@@ -43,7 +43,7 @@ class EvaluationConfig:
         obstacles_may_leave: count as the paper does: only the target fails by leaving the workspace.
         episodes: test scenes to run, from the first.
         seed: of the policy's own randomness.
-        num_envs: scenes side by side; 0 chooses. Results do not depend on it.
+        num_envs: scenes side by side; 0 chooses. With `native` results do not depend on it.
     """
 
     policy: str

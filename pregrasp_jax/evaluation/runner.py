@@ -1,7 +1,8 @@
 """Evaluation by the paper's protocol (Sec. IV-A): fixed test scenes, ten pushes, one grasp.
 
 `num_envs` scenes run side by side and a scene that ends hands its place to the next one of the queue, so
-every scene runs to its end and no result depends on `num_envs`: keys derive from scene and push number.
+every scene runs to its end and with `native` no result depends on `num_envs`: keys derive from scene and push number.
+(`mjx` rounds batches of other sizes differently in the last bit, and contacts amplify that.)
 """
 
 from collections.abc import Callable, Hashable, Iterator
@@ -52,7 +53,7 @@ class Evaluator:
 
         Args:
             env: the test (or validation) environment.
-            num_envs: scenes side by side; results do not depend on it.
+            num_envs: scenes side by side; with `native` results do not depend on it.
         """
         self._env = env
         self._num_envs = max(num_envs, MIN_BATCH)

@@ -23,8 +23,7 @@ from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, HullBank, PhysicsObservation, SceneParams
 
 LIMITS = Limits(max_hull_pairs=32, max_robot_pairs=16, max_contact_points=64)
-"""Sizes for 8 slots of 6 hulls. Over 2513 states of pushes through 100 packed scenes of the seen set the 99.9th
-percentiles are 25 hull pairs, 11 robot pairs and 48 contacts (most seen: 25, 12 and 50)."""
+"""Sizes for 8 slots of 6 hulls, from pushes through packed scenes (`python benchmarks/mjx_limits.py`, docs/mjx.md)."""
 
 MAX_FALL = 0.05
 """m; an object whose frame is this far below the table has gone through it: diverged."""
@@ -39,8 +38,7 @@ class MjxState(struct.PyTreeNode):
         qacc_warmstart: [nv].
         object_ids: [MAX_OBJECTS] int32.
         diverged: () bool; the rest is then the last state before that.
-        pair_overflows: () int32 physics steps since the reset in which overlapping pairs were dropped.
-        contact_overflows: () int32 physics steps since the reset in which penetrating contacts were dropped.
+        overflows: () int32 physics steps since the reset in which overlapping pairs or contacts were dropped.
         max_hull_pairs: () int32 most pairs of hulls with overlapping boxes since the reset.
         max_robot_pairs: () int32 the same for hulls and robot.
         max_contacts: () int32 most penetrating contacts since the reset.
@@ -51,8 +49,7 @@ class MjxState(struct.PyTreeNode):
     qacc_warmstart: jax.Array
     object_ids: jax.Array
     diverged: jax.Array
-    pair_overflows: jax.Array
-    contact_overflows: jax.Array
+    overflows: jax.Array
     max_hull_pairs: jax.Array
     max_robot_pairs: jax.Array
     max_contacts: jax.Array
@@ -89,8 +86,7 @@ def make_engine(
             qacc_warmstart=jnp.zeros(model.mj_model.nv),
             object_ids=object_ids.astype(jnp.int32),
             diverged=no_slot | ~jnp.all(jnp.isfinite(qpos)),
-            pair_overflows=zero,
-            contact_overflows=zero,
+            overflows=zero,
             max_hull_pairs=zero,
             max_robot_pairs=zero,
             max_contacts=zero,
@@ -114,8 +110,7 @@ def make_engine(
     def observe(state: MjxState) -> PhysicsObservation:
         poses = parked.at[:num_slots].set(state.qpos[model.qpos_ids])
         joint_pos = state.qpos[joint_ids]
-        overflows = state.pair_overflows + state.contact_overflows
-        return PhysicsObservation(poses, joint_pos, grasp_pose(joint_pos[:6]), state.diverged, overflows)
+        return PhysicsObservation(poses, joint_pos, grasp_pose(joint_pos[:6]), state.diverged, state.overflows)
 
     def coordinates(state: MjxState) -> tuple[jax.Array, jax.Array]:
         return state.qpos, state.qvel
@@ -165,15 +160,15 @@ def guarded(model: MjxSlotModel, state: MjxState, d: mjx.Data, counts: ContactCo
     above = jnp.all(~present | (d.qpos[model.qpos_ids[:, 2]] > -MAX_FALL))
     fine = finite & slow & above & (counts.depth < MAX_PENETRATION)
     limits = model.limits
-    too_many_pairs = (counts.hull_pairs > limits.max_hull_pairs) | (counts.robot_pairs > limits.max_robot_pairs)
+    too_many = (counts.hull_pairs > limits.max_hull_pairs) | (counts.robot_pairs > limits.max_robot_pairs)
+    too_many |= counts.contacts > limits.max_contact_points
     keep = lambda new, old: jnp.where(fine, new, old)  # noqa: E731
     return state.replace(
         qpos=keep(d.qpos, state.qpos),
         qvel=keep(d.qvel, state.qvel),
         qacc_warmstart=keep(d.qacc_warmstart, state.qacc_warmstart),
         diverged=~fine,
-        pair_overflows=state.pair_overflows + too_many_pairs,
-        contact_overflows=state.contact_overflows + (counts.contacts > limits.max_contact_points),
+        overflows=state.overflows + too_many,
         max_hull_pairs=jnp.maximum(state.max_hull_pairs, counts.hull_pairs),
         max_robot_pairs=jnp.maximum(state.max_robot_pairs, counts.robot_pairs),
         max_contacts=jnp.maximum(state.max_contacts, counts.contacts),

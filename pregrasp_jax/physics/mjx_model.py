@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from pregrasp_jax.physics import native
 from pregrasp_jax.physics.hull_collision import Limits
 from pregrasp_jax.physics.hull_table import HullTable, make_hull_table
 from pregrasp_jax.robot import model as robot
@@ -35,9 +36,9 @@ PAD_FRICTION, PAD_IMPEDANCE = 2**0.5, (0.995, 0.9995)
 `impratio` only harder contacts slip less. Of 84 grasps of objects that stand up to 1 cm before the palm 86 % hold with
 the values of `native`, 98 % with these, as many as in `native` (`python benchmarks/grasp.py --scatter --like-mjx`)."""
 
-DIFFERENCES = ("hulls", "solver", "condim")
-"""In what this model is not that of `native`: coarse hulls, a pyramidal cone with firmer pads and a solver of fixed
-iterations on dense matrices, and three contact dimensions also at the pads."""
+DIFFERENCES = ("hulls", "solver", "condim", "awake")
+"""In what this model is not that of `native`: coarse hulls, a pyramidal cone with firmer pads and fewer iterations on
+dense matrices, three contact dimensions also at the pads, and no sleep of objects at rest."""
 
 
 class ObjectTable(struct.PyTreeNode):
@@ -168,7 +169,9 @@ def make_reference_model(bank: HullBank, differences: Collection[str] = DIFFEREN
         differences: which of `DIFFERENCES` to take over.
     """
     hulls = bank.replace(full=bank.coarse) if "hulls" in differences else bank
-    model = slot_model.make_slot_model(robot.load_spec(), hulls)
+    model = slot_model.make_slot_model(native.load_spec(), hulls)
+    if "awake" in differences:
+        model.mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     if "solver" in differences:
         _choose_solver(model.mj_model.opt, map(model.mj_model.geom, range(model.mj_model.ngeom)))
     if "condim" in differences:
@@ -197,20 +200,20 @@ def _tabulate(bank: HullBank, hulls: HullTable, num_hulls: int) -> ObjectTable:
     What `mj_setConst` derives it derives here, with one object after the other in the first slot: a free body's
     constants depend on nothing but itself.
     """
-    native = slot_model.make_slot_model(robot.load_spec(), bank)
+    slots = slot_model.make_slot_model(robot.load_spec(), bank)
     hull_ids = np.vstack([np.asarray(bank.object_hulls)[:, :num_hulls], np.full((1, num_hulls), -1)])
     geom = {
         "geom_pos": np.asarray(hulls.centre)[hull_ids],
         "geom_quat": np.tile([1.0, 0.0, 0.0, 0.0], (*hull_ids.shape, 1)),
         "geom_rbound": np.linalg.norm(np.asarray(hulls.vert), axis=-1).max(axis=-1)[hull_ids],
-        "geom_friction": native.fields["geom_friction"][:, :num_hulls],
+        "geom_friction": slots.fields["geom_friction"][:, :num_hulls],
     }
     rows: dict[str, list[np.ndarray]] = {name: [] for name in (*BODY_FIELDS, *DOF_FIELDS)}
-    target = copy.copy(native.mj_model)
+    target = copy.copy(slots.mj_model)
     for row in [*range(len(bank.names)), -1]:
-        slot_model.write_slots(native, target, np.array([row] + [-1] * (MAX_OBJECTS - 1)))
+        slot_model.write_slots(slots, target, np.array([row] + [-1] * (MAX_OBJECTS - 1)))
         for name, values in rows.items():
-            ids = native.slot_body_ids[0] if name in BODY_FIELDS else native.slot_dof_ids[0]
+            ids = slots.slot_body_ids[0] if name in BODY_FIELDS else slots.slot_dof_ids[0]
             values.append(getattr(target, name)[ids].copy())
     arrays = {name: jnp.asarray(np.stack(values), float) for name, values in rows.items()}
     return ObjectTable(

@@ -27,7 +27,8 @@ def require(release: str | None) -> None:
     """
     if release not in SUPPORTED:
         found = f"mujoco-mjx {release} is installed" if release else "mujoco-mjx is not installed"
-        raise ValueError(f"physics.engine = 'mjx': {found}; allowed: {', '.join(SUPPORTED)}")
+        wanted = f"allowed: {', '.join(SUPPORTED)} (pip install mujoco-mjx=={SUPPORTED[-1]})"
+        raise ValueError(f"physics.engine = 'mjx' or 'warp': {found}; {wanted}")
 
 
 require(installed())

@@ -22,7 +22,8 @@ def make_engine() -> None:
     mjx_version.require(mjx_version.installed())
     if importlib.util.find_spec("warp") is None:
         raise ValueError(
-            f"physics.engine = 'warp' needs warp-lang: pip install 'pregrasp_jax[warp]', and an NVIDIA GPU; {_OTHERS}"
+            "physics.engine = 'warp' needs warp-lang: pip install 'pregrasp_jax[warp]', an NVIDIA GPU, and an MJX-Warp "
+            f"with meshes per scene, which mujoco-mjx {mjx_version.installed()} does not have; {_OTHERS}"
         )
     platforms = sorted({device.platform for device in jax.devices()})
     if "gpu" not in platforms:

@@ -5,6 +5,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import flax.struct as struct
@@ -30,7 +31,7 @@ from pregrasp_jax.training.learn import (
 from pregrasp_jax.training.sharding import Layout
 
 CACHE_SWITCH = "PREGRASP_JAX_COMPILATION_CACHE"
-"""Environment variable: 0 turns the compilation cache off."""
+"""Environment variable: 0 turns the compilation cache off, wherever it is."""
 
 
 class TrainState(struct.PyTreeNode):
@@ -232,9 +233,18 @@ def _compile(function: Callable[..., Any], arguments: tuple[Any, ...], shardings
     return jitted.lower(*arguments).compile()
 
 
+def compilation_cache_dir() -> Path | None:
+    """Return where compiled programs are kept: the user's own choice for jax, or the cache folder; None if nowhere."""
+    if os.environ.get(CACHE_SWITCH) == "0":
+        return None
+    return Path(jax.config.values["jax_compilation_cache_dir"] or io.cache_dir() / "jax")
+
+
 def enable_compilation_cache() -> None:
-    """Keep compiled programs in the cache folder, unless the user chose another or switched it off."""
-    if os.environ.get(CACHE_SWITCH) == "0" or jax.config.values["jax_compilation_cache_dir"]:
-        return
-    jax.config.update("jax_compilation_cache_dir", str(io.cache_dir() / "jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    """Keep compiled programs in `compilation_cache_dir`."""
+    folder = compilation_cache_dir()
+    if folder is None:
+        jax.config.update("jax_enable_compilation_cache", False)
+    elif not jax.config.values["jax_compilation_cache_dir"]:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
