@@ -46,7 +46,7 @@ def stages(model: MjxSlotModel) -> dict[str, tuple[Stage, ...]]:
         return collide(m, d, model.hulls, ids, model.limits)[0]
 
     return {
-        "kinematics and inertia": of_mjx(smooth.kinematics, smooth.com_pos, smooth.tendon, smooth.crb, smooth.factor_m),
+        "kinematics and inertia": of_mjx(mjx.kinematics, smooth.com_pos, smooth.tendon, smooth.crb, smooth.factor_m),
         "collisions": (collisions,),
         "constraints": of_mjx(constraint.make_constraint, smooth.transmission),
         "velocity, actuation, acceleration": of_mjx(
@@ -72,11 +72,12 @@ def time_prefix(model: MjxSlotModel, parts: list[Stage], batch: tuple[Any, ...],
         m, ids = fill_slots(model, object_ids)
 
         def once(_: Any, qpos: jax.Array) -> jax.Array:
-            d = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
+            d = start = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
             for part in parts:
                 d = part(m, d, ids)
-            leaves = [x for x in jax.tree.leaves(d) if jnp.issubdtype(x.dtype, jnp.floating)]
-            return qpos + _TINY * sum(jnp.sum(jnp.clip(x, -1.0, 1.0)) for x in leaves)
+            pairs = zip(jax.tree.leaves(d), jax.tree.leaves(start), strict=True)
+            made = [new for new, old in pairs if new is not old and jnp.issubdtype(new.dtype, jnp.floating)]
+            return qpos + _TINY * sum(jnp.sum(jnp.clip(x, -1.0, 1.0)) for x in made)
 
         return jax.lax.fori_loop(0, steps, once, qpos)
 
