@@ -37,7 +37,7 @@ def make_contacts_of(model: MjxSlotModel) -> Callable[..., Any]:
 
     def contacts_of_one(object_ids, qpos):
         m, hull_ids = mjx_model.fill_slots(model, object_ids)
-        with jax.numpy_rank_promotion("allow"):  # MJX's own code needs it
+        with jax.numpy_rank_promotion("allow"), jax.default_matmul_precision("highest"):  # as the engine does
             data = mujoco_mjx.kinematics(m, template.replace(qpos=qpos))
             data, counts = collide(m, data, model.hulls, hull_ids, model.limits)
         contact = data._impl.contact

@@ -85,10 +85,9 @@ def main() -> None:
             compile_program = self.program.compile
             built: list[Program] = []
 
-            def compile_once(state: TrainState) -> tuple[Program, float]:
-                program, seconds = compile_program(state)
-                built.append(program)
-                return program, seconds
+            def compile_once(state: TrainState) -> Program:
+                built.append(compile_program(state))
+                return built[-1]
 
             object.__setattr__(self.program, "compile", compile_once)
             ending = super().run(stop)

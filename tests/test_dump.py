@@ -101,7 +101,7 @@ def dumps(env, tmp_path_factory) -> dict[str, Path]:
     paths, program = {}, None
     for what in ("flung", "nan"):
         trainer = make_trainer(tmp_path_factory.mktemp("runs") / what, config(), env=env)
-        trainer.program = program or trainer.program.compile(trainer.state)[0]
+        trainer.program = program or trainer.program.compile(trainer.state)
         program = trainer.program
         actors = trainer.state.actors
         states = broken(env, actors.env_states, what)

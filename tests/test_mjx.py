@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mjx_contacts import AMPLE
 from mjx_oracle import CoarseModel
 from mujoco import mjx as mujoco_mjx
 
@@ -31,11 +30,6 @@ ROW_START, ROW_GAP = -0.19, 0.002
 @pytest.fixture(scope="module")
 def bank():
     return builtin_bank("seen")
-
-
-@pytest.fixture(scope="module")
-def model(bank):
-    return mjx_model.make_mjx_slot_model(bank, limits=AMPLE)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +110,7 @@ def pushed(bank, engine, plans):
     return run, traces, states, run(states, both.ctrl, both.num_ctrl)
 
 
-def test_a_push_moves_objects_as_c_does(bank, model, oracle, engine, plans, pushed):
+def test_a_push_moves_objects_as_c_does(bank, oracle, engine, plans, pushed):
     """Same hulls and options: final poses near those of C after pushes that move them by 17 and 47 mm.
 
     How near can be asked, measured with start poses shifted at random: in the row of three, 1e-7 m (the rounding of
@@ -135,7 +129,7 @@ def test_a_push_moves_objects_as_c_does(bank, model, oracle, engine, plans, push
         error = np.linalg.norm(np.asarray(seen.object_poses)[i, :count, :3] - reference[:count, :3], axis=1)
         assert moved.min() > 0.01
         assert error.max() < NEAR[i], (moved, error)
-        np.testing.assert_allclose(seen.joint_pos[i], data.qpos[robot.joint_qpos_ids(model.mj_model)], atol=2e-3)
+        np.testing.assert_allclose(seen.joint_pos[i], data.qpos[robot.joint_qpos_ids(oracle.model)], atol=2e-3)
     assert not seen.diverged.any()
     assert not after.overflows.any()
     assert after.max_contacts.min() > 4

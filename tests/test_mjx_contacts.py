@@ -51,6 +51,13 @@ def test_c_gets_the_options_of_mjx(model, oracle):
     damped = mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     assert oracle.model.opt.disableflags & damped == model.mj_model.opt.disableflags & damped
     assert set(oracle.model.geom_condim) == set(model.mj_model.geom_condim) == {3}
+    for mj_model in (oracle.model, model.mj_model):
+        pads = [mj_model.geom(f"hand_{side}_pad") for side in ("left", "right")]
+        for pad in pads:
+            assert pad.friction[0] == pytest.approx(2**0.5), "the pyramid around the cone of native's friction 1"
+            np.testing.assert_allclose(pad.solimp[:2], [0.995, 0.9995])
+        others = [i for i in range(mj_model.ngeom) if i not in {pad.id for pad in pads}]
+        assert mj_model.geom_friction[others, 0].max() < 1
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +194,7 @@ def test_the_least_overlapping_pairs_and_the_shallowest_contacts_are_dropped(ban
     dropped = np.zeros(3, int)
     for s in range(NUM_TIGHT):
         state = oracle.fill(object_ids[s], qpos[s, model.qpos_ids])
-        overlaps = overlapping_boxes(oracle, model, state, object_ids[s])
+        overlaps = overlapping_boxes(oracle, state)
         limits = {"hulls": TIGHT.max_hull_pairs, "box": TIGHT.max_robot_pairs, "capsule": TIGHT.max_robot_pairs}
         kept = {pair for kind, pairs in overlaps.items() for _, pair in sorted(pairs)[: limits[kind]]}
         contacts = [c for c in touching(model, everything, s) if "table" in c[1] or c[1] in kept]
@@ -206,7 +213,7 @@ def test_the_least_overlapping_pairs_and_the_shallowest_contacts_are_dropped(ban
     assert (dropped > 0).all(), "nothing was dropped"
 
 
-def overlapping_boxes(oracle, model, state, object_ids) -> dict[str, list[tuple[float, tuple[str, str]]]]:
+def overlapping_boxes(oracle, state) -> dict[str, list[tuple[float, tuple[str, str]]]]:
     """Return (gap m, names) of hulls and of hull and robot, by kind, whose world-aligned boxes overlap."""
     mujoco.mj_kinematics(oracle.model, state)
     names = [oracle.model.geom(g).name for g in range(oracle.model.ngeom) if oracle.model.geom_contype[g]]

@@ -68,7 +68,7 @@ def training() -> Training:
     config = dataclasses.replace(PRESETS["ci"], train=dataclasses.replace(PRESETS["ci"].train, fused_iterations=2))
     built = program.make_program(env, config, q_function=q_function)
     before = jax.jit(built.init)(jax.random.key(0))
-    iterate = built.compile(before)[0].iterate
+    iterate = built.compile(before).iterate
     assert iterate is not None
     donated = jax.tree.map(jnp.copy, before)
     after = iterate(donated, np.array([0, 2], np.int32), np.full(2, 0.4, np.float32))

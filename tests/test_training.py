@@ -306,7 +306,7 @@ def test_a_push_is_traced_once_for_shapes_start_and_compilation_and_its_overflow
     built = make_program(config, env)
     built.shapes()
     state = jax.jit(built.init)(jax.random.key(0))
-    compiled, _ = built.compile(state)
+    compiled = built.compile(state)
     params = state.learning.learner.params
     actors, _ = compiled.collect(state.actors, params)
     actors, _ = compiled.collect(actors, params)

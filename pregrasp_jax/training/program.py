@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -110,18 +109,17 @@ class Program:
         split, copied = self.layout.split, self.layout.copied
         return TrainState(Actors(split, copied, copied, copied), copied)  # pyright: ignore[reportArgumentType]
 
-    def compile(self, state: TrainState) -> tuple["Program", float]:
-        """Return the program compiled for a state, and the seconds that it took.
+    def compile(self, state: TrainState) -> "Program":
+        """Return the program compiled for a state.
 
         Compiled ahead, a function that would need a second trace fails instead of compiling in silence.
         """
-        start = time.perf_counter()
         state = _shapes(state)
         of_state, copied = self._shardings, self.layout.copied
         if self.fused_iterations:
             due = (jax.ShapeDtypeStruct((self.fused_iterations,), dtype) for dtype in (jnp.int32, jnp.float32))
             iterate = _compile(make_iterate(self), (state, *due), (of_state, copied, copied), of_state)
-            return dataclasses.replace(self, iterate=iterate), time.perf_counter() - start
+            return dataclasses.replace(self, iterate=iterate)
         arguments = (state.actors, state.learning.learner.params)
         experience = jax.eval_shape(self.collect, *arguments)[1]
         parts = {
@@ -129,7 +127,7 @@ class Program:
             "remember": _compile(self.remember, (state.learning, experience), (copied, copied), copied),
             "update": _compile(self.update, (state.learning, np.float32(0)), (copied, copied), copied),
         }
-        return dataclasses.replace(self, **parts), time.perf_counter() - start
+        return dataclasses.replace(self, **parts)
 
 
 def make_program(

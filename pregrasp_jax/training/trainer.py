@@ -166,7 +166,7 @@ class Trainer:
             return "the run is complete; a higher --train.episodes or --train.minutes extends it"
         start = time.perf_counter()
         with announced_compilation(self.console.say):
-            program, _ = self.program.compile(self.state)
+            program = self.program.compile(self.state)
             self.compile_evaluation(self._average())
         self._compiled_in = time.perf_counter() - start
         self.console.start()

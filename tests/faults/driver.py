@@ -52,10 +52,10 @@ def break_call(function: Callable[..., Any], count: int, happen: Callable[[], No
 def break_program(moment: str, count: int, happen: Callable[[], None]) -> None:
     compile_program = Program.compile
 
-    def compile_broken(self: Program, state: Any) -> tuple[Program, float]:
-        program, seconds = compile_program(self, state)
+    def compile_broken(self: Program, state: Any) -> Program:
+        program = compile_program(self, state)
         broken: Any = {moment: break_call(getattr(program, moment), count, happen)}
-        return dataclasses.replace(program, **broken), seconds
+        return dataclasses.replace(program, **broken)
 
     Program.compile = compile_broken  # pyright: ignore[reportAttributeAccessIssue]
 

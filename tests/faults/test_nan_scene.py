@@ -52,7 +52,7 @@ def trainer(tmp_path_factory) -> Trainer:
 
 
 def test_the_scene_ends_and_its_neighbours_do_not_notice(trainer):
-    program, _ = trainer.program.compile(trainer.state)
+    program = trainer.program.compile(trainer.state)
     params = trainer.state.learning.learner.params
 
     def collect(actors: Actors) -> Any:
