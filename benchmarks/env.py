@@ -26,15 +26,17 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from pregrasp_jax import grid, heightmap, primitives
+from pregrasp_jax import heightmap
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.task import push
 from pregrasp_jax.config import PRESETS
-from pregrasp_jax.env import Env, make_env
+from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.types import CLOSED, OPEN, EnvState
 
 LENGTHS = (0.05, 0.15)
 """m; push lengths are uniform in this range, 0.1 m on average."""
 
-SETTLE_TIME = primitives.SETTLE_TIME
+SETTLE_TIME = push.SETTLE_TIME
 
 
 def sample_action(state: EnvState, key: jax.Array) -> jax.Array:
@@ -100,7 +102,7 @@ def measure(num_scenes: int, num_steps: int) -> dict[str, Any]:
 def compile_stages(env: Env) -> dict[str, Callable[..., Any]]:
     """Return the stages of a step, each vmapped and compiled alone."""
 
-    def physics(state: EnvState, plan: primitives.Plan) -> Any:
+    def physics(state: EnvState, plan: push.Plan) -> Any:
         return env.engine.run(state.physics, plan.ctrl, jnp.where(plan.reachable, plan.num_ctrl, 0))
 
     def look(state: EnvState) -> Any:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax.config import PRESETS, AssetsConfig
-from pregrasp_jax.env import Env, make_env
+from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.physics import native
 from pregrasp_jax.physics.mjx_model import make_reference_model
 from pregrasp_jax.robot import model as robot

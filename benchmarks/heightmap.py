@@ -24,7 +24,8 @@ import trimesh
 from scipy.spatial import ConvexHull
 from timing import best_ms
 
-from pregrasp_jax import grid, heightmap
+from pregrasp_jax import heightmap
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.meshes import load_mesh, load_object_dir, mesh_folder
 from pregrasp_jax.assets.settings import load_settings

@@ -22,12 +22,12 @@ import optax
 from timing import best_ms
 
 from pregrasp_jax.config import NetworkConfig, TaskConfig
-from pregrasp_jax.grid import GRID_SIZE
+from pregrasp_jax.spaces.grid import GRID_SIZE
 from pregrasp_jax.learning import learner
 from pregrasp_jax.learning.networks import num_parameters
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.learning.replay import Batch
-from pregrasp_jax.primitives import half_ring_mask
+from pregrasp_jax.task.push import half_ring_mask
 
 MATMUL_SIZE = 2048
 

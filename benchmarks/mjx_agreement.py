@@ -25,11 +25,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax import grid
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.assets.sets import load_bank_for
 from pregrasp_jax.config import SceneConfig, TaskConfig
-from pregrasp_jax.env import Env
-from pregrasp_jax.judge import TARGET_IN_REGION
+from pregrasp_jax.task.env import Env
+from pregrasp_jax.task.rules import TARGET_IN_REGION
 from pregrasp_jax.physics import mjx, native
 from pregrasp_jax.physics.base import Engine
 from pregrasp_jax.physics.mjx_model import make_mjx_slot_model, make_reference_model

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from pregrasp_jax.cli.player import EvaluationConfig, Player, make_player, run_evaluation
+from pregrasp_jax.evaluation.player import EvaluationConfig, Player, make_player, run_evaluation
 from pregrasp_jax.config import AssetsConfig
 from pregrasp_jax.physics import native
 from pregrasp_jax.physics.mjx_model import DIFFERENCES, make_reference_model
-from pregrasp_jax.statistics import compare
+from pregrasp_jax.evaluation.statistics import compare
 
 SHIFT = 1e-6
 """m; standard deviation."""

@@ -20,10 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax import policies
+from pregrasp_jax.policies import scripts
 from pregrasp_jax.config import AssetsConfig, Config, SceneConfig
-from pregrasp_jax.env import Env, make_env
-from pregrasp_jax.judge import RUNNING
+from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.rules import RUNNING
 from pregrasp_jax.physics.mjx import LIMITS
 from pregrasp_jax.physics.mjx_model import make_mjx_slot_model
 
@@ -35,7 +35,7 @@ PERCENTILES = (50, 99, 99.9, 100)
 
 def states_of_pushes(env: Env, scenes: int, pushes: int, every: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield object ids [S, MAX_OBJECTS] and qpos [S, nq] float32 of the scenes that move, every so many rows."""
-    act = jax.jit(jax.vmap(policies.SCRIPTS["guided"](env)))
+    act = jax.jit(jax.vmap(scripts.SCRIPTS["guided"](env)))
     run, coordinates = (jax.jit(jax.vmap(f)) for f in (env.engine.run, env.engine.coordinates))
     plan, conclude = (jax.jit(jax.vmap(f)) for f in (env.plan, env.conclude))
     states = jax.jit(jax.vmap(env.reset_to))(jnp.arange(scenes))

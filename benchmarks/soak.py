@@ -23,10 +23,10 @@ import jax
 import numpy as np
 
 from pregrasp_jax.config import PRESETS, Config
-from pregrasp_jax.env import Env, make_env
+from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.training import collect
-from pregrasp_jax.training.program import enable_compilation_cache
+from pregrasp_jax.machine import enable_compilation_cache
 from pregrasp_jax.types import EnvState
 
 MIN_HEIGHT = -0.01

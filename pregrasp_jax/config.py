@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-Engine = Literal["native", "mjx", "warp"]
-Camera = Literal["orthographic", "pinhole"]
+EngineName = Literal["native", "mjx"]
+CameraName = Literal["orthographic", "pinhole"]
 Architecture = Literal["paper", "compact"]
 ObjectSet = Literal["seen", "unseen"]
 
@@ -50,6 +50,12 @@ class SceneConfig:
 class TaskConfig:
     """The task of the paper: pushes in a half ring, ten per episode."""
 
+    workspace: str = "table"
+    """Where: a name in `spaces.workspace.WORKSPACES`."""
+    robot: str = "ur5e_rg2"
+    """Who: a name in `robot.ROBOTS`."""
+    primitive: str = "push"
+    """Does what, and judged how: a name in `task.registry.KINDS`."""
     r_in: float = 0.04
     """m, inner radius of the half ring (Eq. 1)."""
     r_out: float = 0.20
@@ -61,9 +67,13 @@ class TaskConfig:
     obstacles_may_leave: bool = False
     """Only the target ends an episode by leaving the workspace: how the paper counts failures (Sec. IV-A). False lets
     every object end it: how the paper trains (Sec. III-D), and stricter."""
+    in_region_reward: float = 2.0
+    """Reward for the target in the closing region (Sec. III-D)."""
+    approach_reward: float = 0.5
+    """Reward for a push that brings the hand closer to the target (Sec. III-D)."""
     push_speed: float = 0.1
     """m/s, mean speed of the minimum-jerk push."""
-    camera: Camera = "orthographic"
+    camera: CameraName = "orthographic"
     """`orthographic` draws exact heightmaps; `pinhole` sees what a 640 x 480 overhead RGB-D camera sees."""
 
 
@@ -71,8 +81,8 @@ class TaskConfig:
 class PhysicsConfig:
     """Which engine steps the scenes."""
 
-    engine: Engine = "native"
-    """`native`: MuJoCo's C engine on CPU threads; `mjx`: one XLA program; `warp`: says what it lacks."""
+    engine: EngineName = "native"
+    """`native`: MuJoCo's C engine on CPU threads; `mjx`: one XLA program."""
     threads: int = 0
     """Threads of the native engine; 0 takes every core. Results do not depend on it."""
 
@@ -223,6 +233,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "task.r_in": (0.005, 0.5),
     "task.r_out": (0.01, 0.5),
     "task.max_pushes": (1, 100),
+    "task.in_region_reward": (0.0, 100.0),
+    "task.approach_reward": (0.0, 100.0),
     "task.push_speed": (0.02, 1.0),
     "physics.threads": (0, 1024),
     "network.width": (1 / 32, 4.0),

@@ -5,6 +5,7 @@ A pose is ``[x, y, z, qw, qx, qy, qz]``. All functions are unbatched; `jax.vmap`
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 _VERTICAL = 1e-6
 """Faces with |n_z| below this are vertical: they bound a vertical ray's x and y only."""
@@ -79,3 +80,28 @@ def vertical_interval(planes: jax.Array, x: jax.Array, y: jax.Array) -> tuple[ja
     z_bottom = jnp.max(jnp.where(down, z, -jnp.inf), axis=-1)
     outside = jnp.any(~(up | down) & (rest < 0), axis=-1)
     return z_bottom, jnp.where(outside, -jnp.inf, z_top)
+
+
+def matrix_to_pose(matrix: jax.Array) -> jax.Array:
+    """Return the pose [7] of a homogeneous matrix [4, 4], with qw >= 0.
+
+    Each row of the candidates is the quaternion times four times one of its components; the largest is stable.
+    """
+    (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = matrix[:3, :3]
+    candidates = jnp.stack(
+        [
+            jnp.stack([1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01]),
+            jnp.stack([m21 - m12, 1 + m00 - m11 - m22, m10 + m01, m02 + m20]),
+            jnp.stack([m02 - m20, m10 + m01, 1 - m00 + m11 - m22, m21 + m12]),
+            jnp.stack([m10 - m01, m02 + m20, m21 + m12, 1 - m00 - m11 + m22]),
+        ]
+    )
+    quat = candidates[jnp.argmax(jnp.diagonal(candidates))]
+    quat = quat / jnp.linalg.norm(quat)
+    return jnp.concatenate([matrix[:3, 3], jnp.where(quat[0] < 0, -quat, quat)])
+
+
+def matrix_product(a: jax.Array | np.ndarray, b: jax.Array | np.ndarray) -> jax.Array:
+    """Return a @ b for [..., 4, 4] in full float32; written as a sum, which XLA vectorizes over a batch."""
+    a, b = jnp.asarray(a, jnp.float32), jnp.asarray(b, jnp.float32)
+    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)

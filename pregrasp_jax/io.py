@@ -20,6 +20,20 @@ def cache_dir() -> Path:
     return Path(os.environ.get("PREGRASP_JAX_CACHE") or default)
 
 
+def mjcf_dir() -> Path:
+    """Return the folder of the MJCF files: inside an installed package, or beside it in a source checkout.
+
+    Raises:
+        FileNotFoundError: neither place holds table.xml.
+    """
+    package = Path(__file__).resolve().parent
+    places = (package / "mjcf", package.parent / "mjcf")
+    for place in places:
+        if (place / "table.xml").is_file():
+            return place
+    raise FileNotFoundError(f"table.xml is missing; looked in {places[0]} and {places[1]}")
+
+
 def refuse_unwritable(path: Path) -> None:
     """Refuse a file or folder that could not be written, before hours of work are spent on its content.
 

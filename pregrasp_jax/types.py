@@ -21,14 +21,14 @@ FULL_TOPOLOGY = (32, 60, 90)
 COARSE_TOPOLOGY = (16, 28, 42)
 """V, F, E at the `coarse` level (MJX)."""
 
+CTRL_DT = 0.02
+"""s between two rows of a control trajectory; engines interpolate linearly in between."""
+
 TABLE_ID = 0
 """Instance id of the table; slot i has id i + 1."""
 
 ROBOT_ID = MAX_OBJECTS + 1
 """Instance id of every robot link."""
-
-CLOSED, OPEN = 0, 1
-"""Aperture of the hand, and the last axis of the Q map."""
 
 REASONS = (
     "running",
@@ -42,6 +42,26 @@ REASONS = (
     "truncated",
 )
 """Why an episode ended; an integer reason indexes this tuple, earlier entries win."""
+
+OBSTRUCTIONS = ("none", "no_ik", "joint_limit", "table", "wall", "too_long", "end_error")
+"""What keeps a hand from where it is sent: no joint solution, a joint's limit of angle or speed, an arm link too near
+to the table or to a wall, a motion longer than was planned for, or (after the motion) a final error above 10 mm."""
+
+
+class HandPose(struct.PyTreeNode):
+    """Where a hand is sent, and how it is held; it stays horizontal.
+
+    Attributes:
+        xy: [2] float32 m, the grasp point in the world.
+        z: () float32 m above the table.
+        yaw: () float32 rad, the heading, 0 along +x.
+        aperture: () float32 rad, drive angle of the fingers.
+    """
+
+    xy: jax.Array
+    z: jax.Array
+    yaw: jax.Array
+    aperture: jax.Array
 
 
 class Hulls(struct.PyTreeNode):
@@ -74,8 +94,6 @@ class HullBank(struct.PyTreeNode):
         friction: [N] sliding friction of the surface against other objects.
         height: [N] m.
         min_width: [N] m, smallest caliper width of the vertical projection.
-        best_coverage: [N] coverage by the closing region at the best yaw.
-        eligible: [N] bool, whether the object may be a target.
         names: N object names.
         content_hash: hash of everything that shaped the bank.
     """
@@ -90,8 +108,6 @@ class HullBank(struct.PyTreeNode):
     friction: jax.Array
     height: jax.Array
     min_width: jax.Array
-    best_coverage: jax.Array
-    eligible: jax.Array
     names: tuple[str, ...] = struct.field(pytree_node=False)
     content_hash: str = struct.field(pytree_node=False)
 
@@ -115,7 +131,7 @@ class PhysicsObservation(struct.PyTreeNode):
 
     Attributes:
         object_poses: [MAX_OBJECTS, 7] float32.
-        joint_pos: [8] float32 rad: six arm joints, left and right finger drive.
+        joint_pos: [J] float32 rad or m, the joints of the robot in the order of `Robot.joints`.
         hand_pose: [7] float32 pose of the grasp point frame (x forward, z up) in the world.
         diverged: () bool, what the engine holds makes no sense (see `physics.base`): NaN, too fast, too deep, fallen.
         overflows: () int32 physics steps since the reset in which the engine had no room for every contact.
@@ -129,41 +145,49 @@ class PhysicsObservation(struct.PyTreeNode):
 
 
 class Observation(struct.PyTreeNode):
-    """What a camera above the table sees, on the grid (row = y, col = x), and where the hand was sent.
+    """What a camera above the table sees, on the grid (row = y, col = x), and where the hand has been sent.
 
     Attributes:
         height: [H, W] uint8, 0 to 255 for 0 to 0.30 m above the table (see `grid.quantize_height`).
         instance_ids: [H, W] uint8, `TABLE_ID`, slot + 1, or `ROBOT_ID`.
-        p1: [2] float32 m, commanded end of the last push.
+        hand: commanded end of the last push, the start pose before the first.
     """
 
     height: jax.Array
     instance_ids: jax.Array
-    p1: jax.Array
+    hand: HandPose
 
 
 class Outcome(struct.PyTreeNode):
     """What a push did, for every object, so that any of them can be judged as the target (hindsight).
 
     Attributes:
-        coverage: [MAX_OBJECTS] float32 share of each object inside the closing region after the push.
+        coverage: [MAX_OBJECTS] float32 share of each object inside the closing region after the push, as if the hand
+            were open.
+        aperture: () float32 rad, drive angle of the fingers during the push; without open fingers there is no region.
         distance_before: [MAX_OBJECTS] float32 m, planar distance centroid to grasp point before the push.
         distance_after: [MAX_OBJECTS] float32 m, the same after it.
         toppled: [MAX_OBJECTS] bool, tilted more than 0.7 rad after the push.
         off_table: [MAX_OBJECTS] bool, outside the workspace or below the table after the push.
-        unreachable: () bool, the push could not be executed, or ended more than 10 mm away.
-        no_action: () bool, the half ring after the push holds no cell.
+        obstruction: () int32 index into `OBSTRUCTIONS`, what kept the hand from where it was sent.
+        no_action: () bool, no push is allowed after this one.
         diverged: () bool, the physics diverged.
     """
 
     coverage: jax.Array
+    aperture: jax.Array
     distance_before: jax.Array
     distance_after: jax.Array
     toppled: jax.Array
     off_table: jax.Array
-    unreachable: jax.Array
+    obstruction: jax.Array
     no_action: jax.Array
     diverged: jax.Array
+
+    @property
+    def unreachable(self) -> jax.Array:
+        """Return () bool, whether something kept the hand from where it was sent."""
+        return self.obstruction != OBSTRUCTIONS.index("none")
 
 
 class GraspResult(struct.PyTreeNode):
@@ -188,10 +212,8 @@ class EnvState(struct.PyTreeNode):
         scene: what the episode started from.
         scene_index: () int32 row of the scene bank.
         physics_obs: what the engine reports now.
-        obs: what the camera sees now.
-        centroids: [MAX_OBJECTS, 2] float32 m, planar centre of mass of each object.
-        p1: [2] float32 m, commanded end of the last push, centre of the half ring.
-        aperture: () int32, `CLOSED` or `OPEN`.
+        obs: what the camera sees now, and where the hand has been sent.
+        centroids: [MAX_OBJECTS, 3] float32 m, centre of mass of each object.
         num_pushes: () int32 pushes so far in this episode.
     """
 
@@ -201,9 +223,17 @@ class EnvState(struct.PyTreeNode):
     physics_obs: PhysicsObservation
     obs: Observation
     centroids: jax.Array
-    p1: jax.Array
-    aperture: jax.Array
     num_pushes: jax.Array
+
+    @property
+    def hand(self) -> HandPose:
+        """Return where the hand has been sent."""
+        return self.obs.hand
+
+    @property
+    def target_xy(self) -> jax.Array:
+        """Return the planar centre of mass [2] m of the target."""
+        return self.centroids[self.scene.target, :2]
 
 
 class StepResult(struct.PyTreeNode):
@@ -215,6 +245,7 @@ class StepResult(struct.PyTreeNode):
         terminated: () bool, the episode ended by itself.
         truncated: () bool, it ran out of pushes.
         reason: () int32 index into `REASONS`.
+        seconds: () float32 s, how long the robot took; 0 for a push that was not executed.
     """
 
     outcome: Outcome
@@ -222,3 +253,4 @@ class StepResult(struct.PyTreeNode):
     terminated: jax.Array
     truncated: jax.Array
     reason: jax.Array
+    seconds: jax.Array

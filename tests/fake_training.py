@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from fake_env import FakeEnv
 
-from pregrasp_jax import grid
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.config import PRESETS, Config, from_dict, to_dict
 from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.training import program

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pregrasp_jax import grid, heightmap, primitives
+from pregrasp_jax import heightmap
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.task import push
 from pregrasp_jax.config import PRESETS, NetworkConfig, TaskConfig
 from pregrasp_jax.learning.compact import (
     PATCH,
@@ -63,7 +65,7 @@ def test_window_holds_every_cell_of_the_ring(r_out, full_ring):
     size = window_size(task)
     assert size.shape[0] % PATCH == 1 and size.shape[1] % PATCH == 0
     for p1 in (START, (0.0025, 0.0025), (0.1975, -0.2475)):
-        mask = primitives.half_ring_mask(jnp.array(p1), r_in=task.r_in, r_out=r_out, full_ring=full_ring)
+        mask = push.half_ring_mask(jnp.array(p1), r_in=task.r_in, r_out=r_out, full_ring=full_ring)
         origin = look_around_hand(observation(p1), jnp.int32(0), size=size).origin
         inside = paste(jnp.ones((*size.shape, 2)), origin)[..., 0]
         assert bool(jnp.all(inside[mask] == 1.0)) and bool(mask.any())
@@ -184,7 +186,7 @@ def test_unguided_exploration_stays_where_the_network_has_values_on_both_sides(h
     assert q.mirror_fn is not None
     here, there = (np.asarray(q.network.apply({"params": params}, x))[0, ..., 0] for x in (inputs, q.mirror_fn(inputs)))
     np.testing.assert_array_equal(q.domain_fn(obs.p1), (here != 0) & (there[::-1] != 0))
-    mask = primitives.half_ring_mask(obs.p1, r_in=0.04, r_out=0.2, full_ring=full_ring)
+    mask = push.half_ring_mask(obs.p1, r_in=0.04, r_out=0.2, full_ring=full_ring)
     assert not (mask & ~q.domain_fn(obs.p1)).any()
 
 
@@ -194,7 +196,7 @@ def test_untrained_it_promises_its_bias_everywhere_and_learns_in_every_layer():
     params = q.init(jax.random.key(0))
     assert num_parameters(params) == 117_922  # also the size that config.py and README name
     values = q.values(params, observation(START), jnp.int32(0))
-    mask = primitives.half_ring_mask(jnp.asarray(START), r_in=config.task.r_in, r_out=config.task.r_out)
+    mask = push.half_ring_mask(jnp.asarray(START), r_in=config.task.r_in, r_out=config.task.r_out)
     np.testing.assert_allclose(values[mask], 0.5, atol=0.05)
     inputs = jax.tree.map(lambda x: x[None], q.input_fn(observation((-0.1025, 0.0025)), jnp.int32(0)))
     gradient = jax.grad(lambda p: q.of_action(p, inputs, jnp.array([2 * (50 * 100 + 50)]))[0])(params)

@@ -6,7 +6,8 @@ import pytest
 from heightmap_oracle import box_cloud, make_instances, pad
 from PIL import Image
 
-from pregrasp_jax import drawing, grid
+from pregrasp_jax import drawing
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.assets.bank import select
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.drawing import shaded

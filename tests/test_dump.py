@@ -18,7 +18,7 @@ from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.cli.replay import Replay, make_replay, make_replay_env
 from pregrasp_jax.config import Config, ExplorationConfig
-from pregrasp_jax.env import Env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.physics import make_engine
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.scene.model import parking_poses

@@ -13,16 +13,17 @@ import pytest
 from fake_env import FakeEnv, fake_env, make_scenes
 from jax.tree_util import Partial
 
-from pregrasp_jax import grid, policies
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.policies import scripts
 from pregrasp_jax.config import Config, SceneConfig, TaskConfig
-from pregrasp_jax.env import make_env
+from pregrasp_jax.task.env import make_env
 from pregrasp_jax.evaluation import Episode, EvaluationResult, Evaluator, evaluate_policy, results
 from pregrasp_jax.types import OPEN, REASONS, EnvState, GraspResult, Observation
 
 ENV = fake_env()
 
 
-def _reference(env: Any, policy: policies.Policy, episodes: int, seed: int, with_grasp: bool) -> list[Episode]:
+def _reference(env: Any, policy: scripts.Policy, episodes: int, seed: int, with_grasp: bool) -> list[Episode]:
     """One scene after the other, unbatched, from the definitions."""
     step, policy, rows = jax.jit(env.step), jax.jit(policy), []
     for scene in range(episodes):
@@ -57,7 +58,7 @@ class _Shaky(FakeEnv):
 
 def test_what_happens_during_a_grasp_is_not_silent() -> None:
     env: Any = _Shaky()
-    result = evaluate_policy(env, policies.SCRIPTS["straight"](ENV), episodes=12, num_envs=5)
+    result = evaluate_policy(env, scripts.SCRIPTS["straight"](ENV), episodes=12, num_envs=5)
     grasped = [e for e in result.episodes if e.reason in ("target_in_region", "nan")]
     assert {e.reason for e in grasped if e.scene % 2} == {"nan"}
     assert {e.reason for e in grasped if not e.scene % 2} == {"target_in_region"}
@@ -73,20 +74,20 @@ def _assert_equal(result: EvaluationResult, expected: list[Episode]) -> None:
 
 @pytest.mark.parametrize(("name", "with_grasp"), [("straight", True), ("clear", False), ("random", True)])
 def test_agrees_with_a_loop_over_single_scenes(name: str, with_grasp: bool) -> None:
-    policy = policies.SCRIPTS[name](ENV)
+    policy = scripts.SCRIPTS[name](ENV)
     expected = _reference(ENV, policy, 12, 3, with_grasp)
     _assert_equal(evaluate_policy(ENV, policy, episodes=12, seed=3, with_grasp=with_grasp, num_envs=5), expected)
 
 
 def test_reference_scenes_cover_what_matters() -> None:
-    reasons = {e.reason for e in evaluate_policy(ENV, policies.make_straight(ENV), episodes=12).episodes}
+    reasons = {e.reason for e in evaluate_policy(ENV, scripts.make_straight(ENV), episodes=12).episodes}
     assert {"target_in_region", "grasp_failed"} <= reasons, reasons
-    reasons = {e.reason for e in evaluate_policy(ENV, policies.make_random(ENV), episodes=12).episodes}
+    reasons = {e.reason for e in evaluate_policy(ENV, scripts.make_random(ENV), episodes=12).episodes}
     assert {"obstacle_in_region", "truncated", "unreachable"} <= reasons, reasons
 
 
 def test_does_not_depend_on_num_envs() -> None:
-    policy = policies.make_random(ENV)
+    policy = scripts.make_random(ENV)
     first, *others = (evaluate_policy(ENV, policy, episodes=11, seed=1, num_envs=n) for n in (1, 4, 32))
     assert all(other == first for other in others)
     assert [episode.scene for episode in first.episodes] == list(range(11))
@@ -96,12 +97,12 @@ def test_does_not_depend_on_num_envs() -> None:
 def test_real_scenes_do_not_depend_on_num_envs() -> None:
     # Contacts amplify the last bit: this fails if a batch size rounds differently, see `runner.MIN_BATCH`.
     env = make_env(Config(scene=SceneConfig(test_scenes=8)), split="test")
-    first, *others = (evaluate_policy(env, policies.make_clear(env), episodes=8, num_envs=n) for n in (1, 5, 8))
+    first, *others = (evaluate_policy(env, scripts.make_clear(env), episodes=8, num_envs=n) for n in (1, 5, 8))
     assert all(other == first for other in others)
 
 
 def test_seed_moves_only_the_policy() -> None:
-    random, straight = policies.make_random(ENV), policies.make_straight(ENV)
+    random, straight = scripts.make_random(ENV), scripts.make_straight(ENV)
     evaluator = Evaluator(ENV, num_envs=12)
     assert evaluator.run(random, episodes=12, seed=0) != evaluator.run(random, episodes=12, seed=1)
     assert evaluator.run(straight, episodes=12, seed=0) == evaluator.run(straight, episodes=12, seed=1)
@@ -109,7 +110,7 @@ def test_seed_moves_only_the_policy() -> None:
 
 def test_a_run_compiles_nothing_that_was_not_announced() -> None:
     """After `compile`, runs of policies of that kind find everything there, and end as they would without it."""
-    straight = policies.make_straight(ENV)
+    straight = scripts.make_straight(ENV)
 
     def act(far: jax.Array, state: EnvState, key: jax.Array) -> jax.Array:
         return jnp.where(far > 0, straight(state, key), 0)
@@ -138,7 +139,7 @@ def test_success_on_the_last_push_counts(pushes: int, reason: str) -> None:
 
     def crawl(state: EnvState, key: jax.Array) -> jax.Array:
         del key
-        row, col = policies.nearest_cell(env.action_mask(state.p1), state.p1 + jnp.array([0.04, 0.0]))
+        row, col = scripts.nearest_cell(env.action_mask(state.p1), state.p1 + jnp.array([0.04, 0.0]))
         return grid.encode_action(row, col, jnp.int32(OPEN))
 
     (episode,) = evaluate_policy(env, crawl, episodes=1).episodes
@@ -148,7 +149,7 @@ def test_success_on_the_last_push_counts(pushes: int, reason: str) -> None:
 def test_a_refused_push_is_not_a_motion() -> None:
     def step_then_dive(state: EnvState, key: jax.Array) -> jax.Array:
         del key
-        row, col = policies.nearest_cell(ENV.action_mask(state.p1), jnp.array([-0.18, 0.0]))
+        row, col = scripts.nearest_cell(ENV.action_mask(state.p1), jnp.array([-0.18, 0.0]))
         return grid.encode_action(jnp.where(state.num_pushes < 1, row, 0), col, jnp.int32(0))
 
     (episode,) = evaluate_policy(ENV, step_then_dive, episodes=1).episodes
@@ -159,7 +160,7 @@ def test_a_refused_push_is_not_a_motion() -> None:
 
 def test_progress_counts_every_episode_once() -> None:
     calls: list[tuple[int, int, int]] = []
-    policy = policies.make_straight(ENV)
+    policy = scripts.make_straight(ENV)
     result = evaluate_policy(ENV, policy, episodes=12, num_envs=4, progress=lambda *args: calls.append(args))
     assert [done for done, _, _ in calls] == sorted(done for done, _, _ in calls)
     assert calls[-1] == (12, 12, result.successes)
@@ -175,7 +176,7 @@ def test_new_parameters_do_not_compile_again() -> None:
         traces.append(1)
         return params * jnp.ones((*obs.height.shape, 2))
 
-    make = policies.make_learned(ENV, q_values)
+    make = scripts.make_learned(ENV, q_values)
     evaluator = Evaluator(ENV, num_envs=3)
     for scale in (1.0, 2.0):
         evaluator.run(make(jnp.float32(scale)), episodes=5)
@@ -185,7 +186,7 @@ def test_new_parameters_do_not_compile_again() -> None:
 @pytest.mark.parametrize("episodes", [0, 13])
 def test_refuses_more_episodes_than_scenes(episodes: int) -> None:
     with pytest.raises(ValueError, match=f"episodes = {episodes} is out of range; this scene bank allows 1 to 12"):
-        evaluate_policy(ENV, policies.make_straight(ENV), episodes=episodes)
+        evaluate_policy(ENV, scripts.make_straight(ENV), episodes=episodes)
 
 
 def _episode(scene: int, reason: str, motions: int, seconds: float = 1.0) -> Episode:

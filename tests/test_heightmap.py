@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from heightmap_oracle import box_cloud, cast_rays, make_instances, random_clouds
 
-from pregrasp_jax import grid, heightmap
+from pregrasp_jax import heightmap
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.heightmap import Camera, HullInstances
 
 CAMERA = Camera(position=jnp.array([0.0, 0.0, 1.0]), rotation=jnp.eye(3), fovy=jnp.deg2rad(42.5))

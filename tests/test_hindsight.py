@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pregrasp_jax.judge import judge
+from pregrasp_jax.task.rules import judge
 from pregrasp_jax.learning import hindsight, replay
 from pregrasp_jax.types import MAX_OBJECTS, REASONS, Observation, Outcome
 

@@ -9,22 +9,22 @@ import pregrasp_jax
 
 PACKAGE = Path(pregrasp_jax.__file__).parent
 ORDER = [
-    ["command_line", "io", "machine", "types"],
-    ["config", "geometry", "grid", "judge"],
+    ["io", "types"],
+    ["config", "geometry", "machine", "spaces"],
     ["assets"],
     ["robot"],
     ["scene"],
     ["physics"],
     ["heightmap"],
-    ["primitives"],
-    ["env"],
+    ["drawing"],
+    ["task"],
     ["learning"],
-    ["exploration", "statistics", "drawing"],
     ["policies"],
-    ["evaluation"],
     ["checkpoint"],
+    ["evaluation"],
     ["training"],
     ["report"],
+    ["command_line"],
     ["cli"],
     ["__main__"],
 ]
@@ -55,3 +55,11 @@ def test_imports_go_one_way(path: Path):
         return
     for other in imported_stages(path):
         assert other == own or RANK[other] < RANK[own], f"{own} imports {other}, which comes later"
+
+
+def test_spaces_import_neither_jax_nor_mujoco():
+    for path in (PACKAGE / "spaces").glob("*.py"):
+        tree = ast.parse(path.read_text())
+        names = [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+        names += [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+        assert not [name for name in names if name.split(".")[0] in ("jax", "flax", "mujoco")], path

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pregrasp_jax.judge import end_reason, judge, reward_terms
+from pregrasp_jax.task.rules import end_reason, judge, reward_terms
 from pregrasp_jax.types import MAX_OBJECTS, REASONS, Outcome
 
 GOAL, OTHER = 2, 5

@@ -9,7 +9,7 @@ import pytest
 from mjx_oracle import CoarseModel
 from mujoco import mjx as mujoco_mjx
 
-from pregrasp_jax import primitives
+from pregrasp_jax.task import push
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.physics import mjx, mjx_model
 from pregrasp_jax.robot import model as robot
@@ -61,9 +61,9 @@ def plans():
     """Pushes of 10 and 7 cm with closed fingers."""
     home = jnp.asarray(robot.home_joint_pos()[:6])
     ends = ((-0.2, 0.0), (-0.23, 0.01))
-    rows = primitives.num_push_rows(0.1, 0.1)
+    rows = push.num_push_rows(0.1, 0.1)
     return [
-        primitives.plan_push(
+        push.plan_push(
             home,
             jnp.asarray(robot.START_POSE[:2]),
             jnp.asarray(end),

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from fake_training import TinyNetwork, input_fn
 
-from pregrasp_jax import policies
+from pregrasp_jax.policies import scripts
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import PRESETS, Config, SceneConfig
-from pregrasp_jax.env import Env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.evaluation import Evaluator
 from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.physics import mjx
@@ -158,7 +158,7 @@ def test_the_fingers_hold_a_can_and_not_the_air():
 
 @pytest.mark.slow
 def test_evaluation_counts_every_episode(full_env):
-    result = Evaluator(full_env, num_envs=2).run(policies.SCRIPTS["guided"](full_env), episodes=2)
+    result = Evaluator(full_env, num_envs=2).run(scripts.SCRIPTS["guided"](full_env), episodes=2)
     assert [episode.scene for episode in result.episodes] == [0, 1]
     assert all(episode.reason in (*REASONS, "grasp_failed") and episode.reason != "nan" for episode in result.episodes)
     assert result.summary()["overflows"] == 0 and sum(episode.motions for episode in result.episodes) > 0

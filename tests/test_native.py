@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pregrasp_jax import primitives
+from pregrasp_jax.task import push
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import SceneConfig
 from pregrasp_jax.physics import make_engine
@@ -16,7 +16,7 @@ from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.types import OPEN, SceneParams
 
 ENDS = ((-0.2, 0.0), (-0.25, 0.1), (-0.15, 0.0))
-NUM_ROWS = primitives.num_push_rows(0.15, 0.1)
+NUM_ROWS = push.num_push_rows(0.15, 0.1)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def packed_scene(scenes, index) -> SceneParams:
 
 @jax.jit
 def plan(joints, start, end):
-    return primitives.plan_push(
+    return push.plan_push(
         joints,
         jnp.asarray(start),
         jnp.asarray(end),
@@ -82,7 +82,7 @@ def test_a_free_push_stays_on_its_line(engine):
         state = engine.reset(engine.init(), empty_scene())
         hand = engine.observe(push(engine, state, start, end, jnp.int32(num_ctrl))).hand_pose[:2] - start
         assert abs(float(np.cross(np.append(direction, 0), np.append(hand, 0))[2])) < 2e-3
-        planned = 0.1414 * float(primitives.minimum_jerk(jnp.float32(num_ctrl * CTRL_DT / 1.414)))
+        planned = 0.1414 * float(push.minimum_jerk(jnp.float32(num_ctrl * CTRL_DT / 1.414)))
         assert abs(float(np.dot(direction, hand)) - planned) < 4e-3
 
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from fake_env import UNREACHABLE_ROWS, FakeEnv, fake_env, make_scenes
 
-from pregrasp_jax import grid, policies
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.policies import scripts
 from pregrasp_jax.config import TaskConfig
-from pregrasp_jax.judge import TARGET_IN_REGION
+from pregrasp_jax.task.rules import TARGET_IN_REGION
 from pregrasp_jax.types import CLOSED, OPEN, REASONS, EnvState, GraspResult, Observation
 
 ENV = fake_env()
@@ -31,7 +32,7 @@ def _end(action: jax.Array) -> tuple[np.ndarray, int]:
 
 def test_straight_ends_on_a_target_in_reach(key: jax.Array) -> None:
     # Neither on the diagonal nor at the centre: swapped rows and columns miss it.
-    end, aperture = _end(policies.make_straight(ENV)(_state((-0.1, -0.1), (-0.0525, 0.0125)), key))
+    end, aperture = _end(scripts.make_straight(ENV)(_state((-0.1, -0.1), (-0.0525, 0.0125)), key))
     np.testing.assert_allclose(end, [-0.0525, 0.0125], atol=1e-6)
     assert aperture == OPEN
 
@@ -41,7 +42,7 @@ def test_straight_ends_on_a_target_in_reach(key: jax.Array) -> None:
 def test_straight_ends_in_the_half_ring_nearest_to_the_target(
     p1: tuple[float, float], target: tuple[float, float], key: jax.Array
 ) -> None:
-    end, _ = _end(policies.make_straight(ENV)(_state(p1, target), key))
+    end, _ = _end(scripts.make_straight(ENV)(_state(p1, target), key))
     axis = -0.25 + 0.005 * (np.arange(100) + 0.5)
     cells = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     radius = np.linalg.norm(cells - p1, axis=1)
@@ -57,15 +58,15 @@ def test_clear_opens_near_the_target(distance: float, aperture: int, key: jax.Ar
     p1 = (-0.1, -0.1)
     target = tuple(float(x) for x in np.asarray(p1) + distance * direction)
     state = _state(p1, (target[0], target[1]))
-    end, chosen = _end(policies.make_clear(ENV)(state, key))
+    end, chosen = _end(scripts.make_clear(ENV)(state, key))
     assert chosen == aperture
-    np.testing.assert_allclose(end, _end(policies.make_straight(ENV)(state, key))[0])
+    np.testing.assert_allclose(end, _end(scripts.make_straight(ENV)(state, key))[0])
 
 
 def test_random_is_uniform_in_the_half_ring(key: jax.Array) -> None:
     state = _state((-0.1, 0.0), (0.1, 0.1))
     keys = jax.random.split(key, 600)
-    actions = jax.jit(jax.vmap(policies.make_random(ENV), (None, 0)))(state, keys)
+    actions = jax.jit(jax.vmap(scripts.make_random(ENV), (None, 0)))(state, keys)
     row, col, aperture = (np.asarray(x) for x in grid.decode_action(actions))
     mask = np.asarray(ENV.action_mask(state.p1))
     assert mask[row, col].all()
@@ -78,7 +79,7 @@ def test_random_is_uniform_in_the_half_ring(key: jax.Array) -> None:
 
 def test_guided_heads_for_the_target(key: jax.Array) -> None:
     state = _state((-0.1, 0.0), (0.0, 0.1))
-    actions = jax.jit(jax.vmap(policies.make_guided(ENV), (None, 0)))(state, jax.random.split(key, 500))
+    actions = jax.jit(jax.vmap(scripts.make_guided(ENV), (None, 0)))(state, jax.random.split(key, 500))
     row, col, aperture = grid.decode_action(actions)
     offset = np.asarray(grid.cell_to_world(row, col)) - np.array([-0.1, 0.0])
     angle = np.arctan2(offset[:, 1], offset[:, 0])
@@ -93,7 +94,7 @@ def test_learned_takes_the_best_allowed_pixel(key: jax.Array) -> None:
     q = jnp.full((100, 100, 2), -5.0)
     q = q.at[rows[1], cols[1], 1].set(9.0).at[outside[0], outside[1], 0].set(8.0)
     q = q.at[rows[0], cols[0], 1].set(-1.0).at[rows[0], cols[0], 0].set(-2.0)
-    make = policies.make_learned(ENV, lambda params, obs, target: params)
+    make = scripts.make_learned(ENV, lambda params, obs, target: params)
     chosen = make(q)(state, key)
     assert chosen == grid.encode_action(rows[0], cols[0], jnp.int32(OPEN))
 
@@ -107,7 +108,7 @@ def test_learned_sees_its_own_target(key: jax.Array) -> None:
         wanted = jnp.zeros((100, 100, 2)).at[cell[0], cell[1], 0].set(1.0)
         return params * wanted * (target == state.scene.target)
 
-    action = policies.make_learned(ENV, q_values)(jnp.float32(1.0))(state, key)
+    action = scripts.make_learned(ENV, q_values)(jnp.float32(1.0))(state, key)
     assert action == grid.encode_action(*cell, jnp.int32(CLOSED))
 
 
@@ -119,7 +120,7 @@ def test_policies_of_one_constructor_share_their_compilation(key: jax.Array) -> 
         traces.append(1)
         return params * jnp.ones((*obs.height.shape, 2))
 
-    make = policies.make_learned(ENV, q_values)
+    make = scripts.make_learned(ENV, q_values)
     decide = jax.jit(lambda policy, state, key: policy(state, key))
     for scale in (1.0, 2.0, 3.0):
         decide(make(jnp.float32(scale)), ENV.reset_to(0), key)
@@ -136,9 +137,9 @@ def _world(xy: list[tuple[float, float]]) -> Any:
 def test_lookahead_succeeds_where_straight_encloses_the_obstacle(key: jax.Array) -> None:
     # The obstacle sits exactly where the first straight push ends.
     env = _world([(-0.1525, 0.0025), (0.0, 0.0), (0.2, 0.2)])
-    state, result = env.step(env.reset_to(0), policies.make_straight(env)(env.reset_to(0), key))
+    state, result = env.step(env.reset_to(0), scripts.make_straight(env)(env.reset_to(0), key))
     assert REASONS[int(result.reason)] == "obstacle_in_region"
-    lookahead, step = jax.jit(policies.make_lookahead(env)), jax.jit(env.step)
+    lookahead, step = jax.jit(scripts.make_lookahead(env)), jax.jit(env.step)
     for episode in range(5):
         state = env.reset_to(0)
         for push in range(3):
@@ -152,10 +153,10 @@ def test_lookahead_never_takes_a_failure_if_a_candidate_survives(key: jax.Array)
     env = _world([(-0.2, 0.2), (0.24, -0.24), (0.2, 0.2)])
     # Near the lower edge a large share of the half ring is out of reach, and the target attracts there.
     state = env.reset_to(0).replace(p1=jnp.array([0.05, -0.2025]))
-    choose = jax.jit(jax.vmap(policies.make_lookahead(env), (None, 0)))
+    choose = jax.jit(jax.vmap(scripts.make_lookahead(env), (None, 0)))
     rows, _, _ = grid.decode_action(choose(state, jax.random.split(key, 6)))
     assert (rows >= UNREACHABLE_ROWS).all()
-    guided, _, _ = grid.decode_action(jax.vmap(policies.make_guided(env), (None, 0))(state, jax.random.split(key, 50)))
+    guided, _, _ = grid.decode_action(jax.vmap(scripts.make_guided(env), (None, 0))(state, jax.random.split(key, 50)))
     assert (guided < UNREACHABLE_ROWS).any(), "the test must offer failures"
 
 
@@ -169,7 +170,7 @@ def test_lookahead_ranks_success_then_distance_then_failure() -> None:
     ]
     rows, cols = zip(*(grid.world_to_cell(jnp.array(xy)) for xy, _ in pushes), strict=True)
     actions = grid.encode_action(jnp.stack(rows), jnp.stack(cols), jnp.array([aperture for _, aperture in pushes]))
-    plans = policies._advance(env, policies._start(env.reset_to(0), 4), actions)
+    plans = scripts._advance(env, scripts._start(env.reset_to(0), 4), actions)
     assert plans.ended.tolist() == [True, False, False, True]
     success, near, far, failure = plans.values.tolist()
     assert success > 0 > near > far > failure
@@ -188,8 +189,8 @@ def test_lookahead_prefers_a_candidate_whose_grasp_holds(key: jax.Array) -> None
     scenes.xy[0, :3], scenes.target[0] = [(0.2, -0.2), (-0.1525, 0.0025), (0.2, 0.2)], 1
     env: Any = _Slippery(scenes=scenes)
     state = env.reset_to(0)
-    assert int(env.step(state, policies.make_straight(env)(state, key))[1].reason) == TARGET_IN_REGION
-    lookahead = jax.jit(policies.make_lookahead(env))
+    assert int(env.step(state, scripts.make_straight(env)(state, key))[1].reason) == TARGET_IN_REGION
+    lookahead = jax.jit(scripts.make_lookahead(env))
     state, _ = env.step(state, lookahead(state, key))
     state, result = env.step(state, lookahead(state, key))
     assert int(result.reason) == TARGET_IN_REGION and env.grasp(state).held
@@ -199,24 +200,24 @@ def test_lookahead_tries_grasps_until_one_holds() -> None:
     # Even scenes hold; the first of them is not enclosed, the last is not reached.
     states = jax.vmap(ENV.reset_to)(jnp.array([2, 1, 4, 6]))
     enclosed = jnp.array([False, True, True, True])
-    assert policies._first_grasp(ENV, states, enclosed).tolist() == [False, False, True, False]
-    assert not policies._first_grasp(ENV, states, enclosed & False).any()
+    assert scripts._first_grasp(ENV, states, enclosed).tolist() == [False, False, True, False]
+    assert not scripts._first_grasp(ENV, states, enclosed & False).any()
 
 
 def test_lookahead_forgives_a_failing_continuation(key: jax.Array) -> None:
     # Whatever comes first, the straight push that follows it encloses the obstacle in front of the target.
     env = _world([(-0.1025, 0.0025), (0.0, 0.0025), (0.2, 0.2)])
     state = env.reset_to(0).replace(p1=jnp.array([-0.2525, 0.0025]))
-    _, result = env.step(state, policies.make_straight(env)(state, key))
+    _, result = env.step(state, scripts.make_straight(env)(state, key))
     assert REASONS[int(result.reason)] == "obstacle_in_region"
-    chosen = jax.jit(policies.make_lookahead(env))(state, key)
+    chosen = jax.jit(scripts.make_lookahead(env))(state, key)
     _, result = env.step(state, chosen)
     assert REASONS[int(result.reason)] == "running"
 
 
 def test_every_script_runs_unbatched_under_jit(key: jax.Array) -> None:
     state = ENV.reset_to(3)
-    for make in policies.SCRIPTS.values():
+    for make in scripts.SCRIPTS.values():
         action = jax.jit(make(ENV))(state, key)
         row, col, _ = grid.decode_action(action)
         assert action.dtype == jnp.int32 and action.shape == ()

@@ -6,15 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pregrasp_jax import grid, primitives
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.task import push
 from pregrasp_jax.physics.base import CTRL_DT
 from pregrasp_jax.robot import kinematics
 from pregrasp_jax.robot import model as robot
 from pregrasp_jax.types import CLOSED, OPEN
 
 SPEED = 0.1
-NUM_ROWS = primitives.num_push_rows(0.15, SPEED)
-PLAN = jax.jit(functools.partial(primitives.plan_push, push_speed=SPEED, num_rows=NUM_ROWS))
+NUM_ROWS = push.num_push_rows(0.15, SPEED)
+PLAN = jax.jit(functools.partial(push.plan_push, push_speed=SPEED, num_rows=NUM_ROWS))
 
 
 def plan(start, end, before=OPEN, after=OPEN):
@@ -36,39 +37,39 @@ def loop_mask(p1, r_in, r_out, full):
 @pytest.mark.parametrize("full", [False, True])
 @pytest.mark.parametrize("p1", [(-0.30, 0.0), (0.0025, 0.0025), (0.2475, -0.2475), (0.4, 0.0)])
 def test_half_ring_is_the_loop_over_cells(p1, full):
-    mask = primitives.half_ring_mask(jnp.array(p1), r_in=0.04, r_out=0.15, full_ring=full)
+    mask = push.half_ring_mask(jnp.array(p1), r_in=0.04, r_out=0.15, full_ring=full)
     np.testing.assert_array_equal(mask, loop_mask(p1, 0.04, 0.15, full))
 
 
 def test_half_ring_ends_are_inclusive():
     p1 = grid.cell_to_world(jnp.int32(50), jnp.int32(20))
-    mask = primitives.half_ring_mask(p1, r_in=0.04, r_out=0.15)
+    mask = push.half_ring_mask(p1, r_in=0.04, r_out=0.15)
     assert mask[50, 28] and not mask[50, 27], "r_in = 8 cells straight ahead"
     assert mask[50, 50] and not mask[50, 51], "r_out = 30 cells straight ahead"
     assert mask[80, 20] and mask[20, 20] and not mask[80, 19], "exactly sideways belongs to it, backward does not"
 
 
 def test_half_ring_is_mirror_symmetric():
-    up = primitives.half_ring_mask(jnp.array([-0.1, 0.03]), r_in=0.04, r_out=0.15)
-    down = primitives.half_ring_mask(jnp.array([-0.1, -0.03]), r_in=0.04, r_out=0.15)
+    up = push.half_ring_mask(jnp.array([-0.1, 0.03]), r_in=0.04, r_out=0.15)
+    down = push.half_ring_mask(jnp.array([-0.1, -0.03]), r_in=0.04, r_out=0.15)
     np.testing.assert_array_equal(up, down[::-1])
 
 
 def test_minimum_jerk_meets_its_boundary_conditions():
-    np.testing.assert_allclose(primitives.minimum_jerk(jnp.array([-1.0, 0.0, 0.5, 1.0, 2.0])), [0, 0, 0.5, 1, 1])
-    velocity = jax.vmap(jax.grad(primitives.minimum_jerk))(jnp.array([1e-3, 0.5, 1 - 1e-3]))
+    np.testing.assert_allclose(push.minimum_jerk(jnp.array([-1.0, 0.0, 0.5, 1.0, 2.0])), [0, 0, 0.5, 1, 1])
+    velocity = jax.vmap(jax.grad(push.minimum_jerk))(jnp.array([1e-3, 0.5, 1 - 1e-3]))
     np.testing.assert_allclose(velocity, [0, 1.875, 0], atol=1e-4)
 
 
 def test_push_times_and_fingers():
     kept = plan((-0.3, 0.0), (-0.2, 0.0))
     changed = plan((-0.3, 0.0), (-0.2, 0.0), OPEN, CLOSED)
-    assert kept.num_ctrl == math.ceil((1.0 + primitives.SETTLE_TIME) / CTRL_DT)
-    assert changed.num_ctrl - kept.num_ctrl == round(primitives.APERTURE_TIME / CTRL_DT)
+    assert kept.num_ctrl == math.ceil((1.0 + push.SETTLE_TIME) / CTRL_DT)
+    assert changed.num_ctrl - kept.num_ctrl == round(push.APERTURE_TIME / CTRL_DT)
     fingers = np.asarray(changed.ctrl[:, 6])
     assert fingers[0] == pytest.approx(robot.FINGER_OPEN)
-    assert fingers[int(primitives.APERTURE_TIME / CTRL_DT) + 1] == pytest.approx(robot.FINGER_CLOSED, abs=1e-6)
-    still = np.asarray(changed.ctrl[: int(primitives.APERTURE_TIME / CTRL_DT), :6])
+    assert fingers[int(push.APERTURE_TIME / CTRL_DT) + 1] == pytest.approx(robot.FINGER_CLOSED, abs=1e-6)
+    still = np.asarray(changed.ctrl[: int(push.APERTURE_TIME / CTRL_DT), :6])
     np.testing.assert_allclose(still, np.broadcast_to(still[0], still.shape), atol=1e-5)
 
 
@@ -88,7 +89,7 @@ def test_too_long_or_short_plans(end):
 def test_out_of_reach_is_unreachable():
     joints = jnp.asarray(robot.home_joint_pos()[:6])
     far = jnp.array([[-0.3 + 0.004 * i, 0.0, 0.1] for i in range(200)])
-    commands, ok = jax.jit(primitives.plan_arm)(joints, far)
+    commands, ok = jax.jit(push.plan_arm)(joints, far)
     assert ok[5] and not ok[-1]
     assert np.isfinite(commands).all(), "a missing solution must not leak NaN into the controls"
 

@@ -12,8 +12,8 @@ import numpy as np
 import optax
 import pytest
 
-from pregrasp_jax.grid import GRID_SIZE
-from pregrasp_jax.judge import judge
+from pregrasp_jax.spaces.grid import GRID_SIZE
+from pregrasp_jax.task.rules import judge
 from pregrasp_jax.learning import hindsight, learner, replay
 from pregrasp_jax.types import MAX_OBJECTS, Observation, Outcome
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pregrasp_jax import statistics
-from pregrasp_jax.statistics import compare, mcnemar_exact, paired_difference_interval, wilson_interval
+from pregrasp_jax.evaluation import statistics
+from pregrasp_jax.evaluation.statistics import compare, mcnemar_exact, paired_difference_interval, wilson_interval
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 1), (0, 30), (1, 1), (93, 100), (67, 100), (15, 15), (81, 263)])

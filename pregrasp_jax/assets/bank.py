@@ -11,15 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from pregrasp_jax import io
 from pregrasp_jax.assets.hulls import make_hulls
-from pregrasp_jax.assets.measure import CLOSING_REGION_SIZE as CLOSING_REGION_SIZE
 from pregrasp_jax.assets.measure import measure
 from pregrasp_jax.types import COARSE_TOPOLOGY, FULL_TOPOLOGY, MAX_HULLS, HullBank, Hulls
-
-MAX_TARGET_WIDTH = 0.105
-"""m; an object whose narrowest width is not below this does not fit between the open fingers."""
-
-MIN_TARGET_COVERAGE = 0.97
-"""An eligible target's best coverage is above this, so that the 0.95 of the task can be reached."""
 
 DEFAULT_DENSITY = 300.0
 """kg/m^3 of the hulls' union: mostly full packages, 0.08 to 0.53 kg over the paper's seen set."""
@@ -27,10 +20,10 @@ DEFAULT_DENSITY = 300.0
 DEFAULT_FRICTION = 0.25
 """Sliding friction between objects."""
 
-FORMAT = "pregrasp_jax hull bank 1"
+FORMAT = "pregrasp_jax hull bank 2"
 """First entry of a bank file; the number changes with the meaning of the arrays."""
 
-_PER_OBJECT = ("mass", "com", "inertia", "inertia_quat", "friction", "height", "min_width", "best_coverage", "eligible")
+_PER_OBJECT = ("mass", "com", "inertia", "inertia_quat", "friction", "height", "min_width")
 
 
 class ConvexObject(NamedTuple):
@@ -98,17 +91,6 @@ def select(bank: HullBank, indices: Sequence[int] | np.ndarray) -> HullBank:
         names=tuple(bank.names[i] for i in indices),
         **{key: np.asarray(getattr(bank, key))[indices] for key in _PER_OBJECT},
     )
-
-
-def ineligibility(bank: HullBank, index: int) -> str:
-    """Return why an object cannot be a target, one clause; empty if it can."""
-    width, coverage = float(bank.min_width[index]), float(bank.best_coverage[index])
-    reasons = []
-    if width >= MAX_TARGET_WIDTH:
-        reasons.append(f"narrowest width {width * 1e3:.0f} mm, must be < {MAX_TARGET_WIDTH * 1e3:.0f}")
-    if coverage <= MIN_TARGET_COVERAGE:
-        reasons.append(f"best coverage {coverage:.2f}, must be > {MIN_TARGET_COVERAGE}")
-    return "; ".join(reasons)
 
 
 def save_bank(path: Path, bank: HullBank) -> None:
@@ -193,8 +175,6 @@ def _make_single(item: ConvexObject) -> HullBank:
         friction=np.array([item.friction]),
         height=np.array([np.asarray(full.vertices)[..., 2].max()]),
         min_width=np.array([found.min_width]),
-        best_coverage=np.array([found.best_coverage]),
-        eligible=np.array([found.min_width < MAX_TARGET_WIDTH and found.best_coverage > MIN_TARGET_COVERAGE]),
     )
 
 
@@ -215,7 +195,7 @@ def _finish(
         object_hulls=jnp.asarray(object_hulls, jnp.int32),
         names=names,
         content_hash="",
-        **{key: jnp.asarray(value, bool if key == "eligible" else jnp.float32) for key, value in rows.items()},
+        **{key: jnp.asarray(value, jnp.float32) for key, value in rows.items()},
     )
     digest = io.content_hash(FORMAT, list(names), *[np.asarray(leaf) for leaf in jax.tree.leaves(bank)])
     return bank.replace(content_hash=digest)

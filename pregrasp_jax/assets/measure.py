@@ -1,4 +1,4 @@
-"""What an object measures: mass properties, narrowest width, and how well the hand's closing region holds it.
+"""What an object measures: mass properties, narrowest width, and its vertical projection.
 
 All of it is computed from the hulls, as their union: overlap between hulls counts once.
 """
@@ -12,17 +12,10 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from pregrasp_jax.geometry import vertical_interval
-from pregrasp_jax.types import MAX_HULLS
-
-CLOSING_REGION_SIZE = (0.0855, 0.110)
-"""m, depth (hand x, palm at 145.6 mm to fingertip at 231.1 mm from the flange) and width (hand y) of the
-rectangle that the closing fingers of the RG2 sweep."""
+from pregrasp_jax.types import MAX_HULLS, HullBank
 
 _COLUMNS = 192
 """Vertical rays per side of the object's bounding rectangle; volumes are good to about 0.2 %."""
-
-_NUM_YAWS = 144
-"""Yaws at which the coverage is tried: every 2.5 degrees."""
 
 
 class Measures(NamedTuple):
@@ -33,32 +26,53 @@ class Measures(NamedTuple):
         com: [3] m.
         inertia: [3, 3] about the centre of mass, m^5 (times density: kg m^2).
         min_width: m, smallest caliper width of the vertical projection.
-        best_coverage: largest share of the vertical projection inside the closing region.
     """
 
     volume: float
     com: np.ndarray
     inertia: np.ndarray
     min_width: float
-    best_coverage: float
 
 
 def measure(vertices: np.ndarray, planes: np.ndarray) -> Measures:
     """Measure the union of M <= `MAX_HULLS` hulls: vertices [M, V, 3] m and planes [M, F, 4]."""
-    xy = vertices[..., :2].reshape(-1, 2).astype(np.float64)
-    outline = xy[ConvexHull(xy).vertices]
-    lower, upper = outline.min(axis=0), outline.max(axis=0)
-    cell = (upper - lower) / _COLUMNS
-    x, y = (lower[i] + cell[i] * (np.arange(_COLUMNS) + 0.5) for i in range(2))
-    x, y = (grid.ravel() for grid in np.meshgrid(x, y))
+    outline = _outline(vertices)
+    points, cell = _raster(outline)
+    x, y = points.T.astype(np.float32)
     # A repeated hull changes no union, and one shape means one compilation.
     padded = planes[np.minimum(np.arange(MAX_HULLS), len(planes) - 1)]
-    bottom, top = (np.asarray(z, np.float64) for z in _intervals(padded, x.astype(np.float32), y.astype(np.float32)))
+    bottom, top = (np.asarray(z, np.float64) for z in _intervals(padded, x, y))
     length, first, second = _union_moments(bottom, top)
     inside = length > 0
-    projection = np.column_stack([x, y])[inside]
-    volume, com, inertia = _mass_properties(projection, length[inside], first[inside], second[inside], cell)
-    return Measures(volume, com, inertia, min_width(outline), best_coverage(projection, outline))
+    volume, com, inertia = _mass_properties(points[inside], length[inside], first[inside], second[inside], cell)
+    return Measures(volume, com, inertia, min_width(outline))
+
+
+def projection(bank: HullBank, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return an object's vertical projection, m: points [K, 2] of cells of equal area, and its outline [P, 2]."""
+    ids = np.asarray(bank.object_hulls[index])
+    vertices = np.asarray(bank.full.vertices)[ids[ids >= 0]]
+    outline = _outline(vertices)
+    points, _ = _raster(outline)
+    inside = np.zeros(len(points), bool)
+    for hull in vertices:
+        sides = ConvexHull(hull[:, :2].astype(np.float64)).equations
+        inside |= (points @ sides[:, :2].T + sides[:, 2] <= 0).all(axis=1)
+    return points[inside], outline
+
+
+def _outline(vertices: np.ndarray) -> np.ndarray:
+    """Return the convex outline [P, 2] m of hulls [M, V, 3] seen from above."""
+    xy = vertices[..., :2].reshape(-1, 2).astype(np.float64)
+    return xy[ConvexHull(xy).vertices]
+
+
+def _raster(outline: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the centres [K, 2] m of the cells of the bounding rectangle, and the size [2] m of a cell."""
+    lower, upper = outline.min(axis=0), outline.max(axis=0)
+    cell = (upper - lower) / _COLUMNS
+    axes = [lower[i] + cell[i] * (np.arange(_COLUMNS) + 0.5) for i in range(2)]
+    return np.column_stack([grid.ravel() for grid in np.meshgrid(*axes)]), cell
 
 
 def min_width(outline: np.ndarray) -> float:
@@ -66,28 +80,6 @@ def min_width(outline: np.ndarray) -> float:
     edges = np.roll(outline, -1, axis=0) - outline
     normals = np.column_stack([-edges[:, 1], edges[:, 0]]) / np.linalg.norm(edges, axis=1, keepdims=True)
     return float(np.ptp(outline @ normals.T, axis=0).min())
-
-
-def best_coverage(projection: np.ndarray, outline: np.ndarray) -> float:
-    """Return the largest share of a projection that fits into the closing region, over yaw.
-
-    At every yaw the object stands flush against the palm (a wall: nothing can lie behind it) and centred
-    between the fingers.
-
-    Args:
-        projection: [K, 2] cells of equal area that cover the vertical projection, m.
-        outline: [P, 2] convex outline of the projection, m.
-
-    Returns:
-        The share in [0, 1].
-    """
-    yaw = np.arange(_NUM_YAWS) * (2 * np.pi / _NUM_YAWS)
-    forward, sideways = np.stack([np.cos(yaw), np.sin(yaw)]), np.stack([-np.sin(yaw), np.cos(yaw)])
-    depth = projection @ forward - (outline @ forward).min(axis=0)
-    extent = outline @ sideways
-    offset = projection @ sideways - (extent.min(axis=0) + extent.max(axis=0)) / 2
-    inside = (depth <= CLOSING_REGION_SIZE[0]) & (np.abs(offset) <= CLOSING_REGION_SIZE[1] / 2)
-    return float(inside.mean(axis=0).max())
 
 
 @jax.jit

@@ -9,7 +9,7 @@ import trimesh
 
 from pregrasp_jax.assets.decompose import repair
 from pregrasp_jax.assets.settings import SETTINGS_FILE, ObjectSettings
-from pregrasp_jax.grid import MAX_HEIGHT
+from pregrasp_jax.spaces.grid import MAX_HEIGHT
 
 SUFFIXES = (".obj", ".stl", ".ply", ".glb")
 """Formats that are read."""

@@ -1,11 +1,11 @@
 """The object set of a run, wherever it comes from, and the table that shows it."""
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from pregrasp_jax.assets.bank import ineligibility
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.meshes import Progress, Refusal, load_object_dir
 from pregrasp_jax.types import HullBank
@@ -28,12 +28,11 @@ def load_bank_for(object_dir: str | Path | None, object_set: str, *, progress: P
     if object_dir is None:
         return builtin_bank(object_set)
     bank, refusals = load_object_dir(Path(object_dir), object_set, progress=progress)
-    targets = int(np.sum(bank.eligible))
-    if len(bank.names) < MIN_OBJECTS or targets == 0:
+    if len(bank.names) < MIN_OBJECTS:
         first = f", the first: {refusals[0].name}: {refusals[0].reason}" if refusals else ""
         raise ValueError(
-            f"{object_dir}: {len(bank.names)} usable '{object_set}' objects of which {targets} can be targets; allowed "
-            f"are at least {MIN_OBJECTS} objects and 1 target. {len(refusals)} were refused{first}; "
+            f"{object_dir}: {len(bank.names)} usable '{object_set}' objects; allowed are at least {MIN_OBJECTS}. "
+            f"{len(refusals)} were refused{first}; "
             f"`python -m pregrasp_jax assets {object_dir}` lists all"
         )
     for refusal in refusals:
@@ -41,20 +40,26 @@ def load_bank_for(object_dir: str | Path | None, object_set: str, *, progress: P
     return bank
 
 
-def format_table(bank: HullBank, refusals: list[Refusal]) -> str:
-    """Return a text table of the objects (hulls, size w x d x h, mass, target or why not) and of the refusals."""
+def format_table(bank: HullBank, refusals: list[Refusal], why_not: Sequence[str]) -> str:
+    """Return a text table of the objects (hulls, size w x d x h, mass, target or why not) and of the refusals.
+
+    Args:
+        bank: the objects.
+        refusals: the meshes that are no objects.
+        why_not: N texts, why an object cannot be a target; empty where it can.
+    """
     header = ("object", "hulls", "size [mm]", "mass [kg]", "target")
-    rows = [header, *(_row(bank, index) for index in range(len(bank.names)))]
+    rows = [header, *(_row(bank, index, why_not[index]) for index in range(len(bank.names)))]
     widths = [max(len(row[column]) for row in rows) for column in range(len(header))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    lines.append(f"{len(bank.names)} objects, {int(np.sum(bank.eligible))} can be targets, {len(refusals)} refused")
+    lines.append(f"{len(bank.names)} objects, {list(why_not).count('')} can be targets, {len(refusals)} refused")
     lines += [f"refused: {refusal.name}: {refusal.reason}" for refusal in refusals]
     return "\n".join(lines)
 
 
-def _row(bank: HullBank, index: int) -> tuple[str, ...]:
+def _row(bank: HullBank, index: int, why_not: str) -> tuple[str, ...]:
     ids = np.asarray(bank.object_hulls[index])
     points = np.asarray(bank.full.vertices)[ids[ids >= 0]].reshape(-1, 3)
     size = " x ".join(f"{extent * 1e3:.0f}" for extent in np.ptp(points, axis=0))
-    target = "yes" if bank.eligible[index] else f"no: {ineligibility(bank, index)}"
+    target = f"no: {why_not}" if why_not else "yes"
     return bank.names[index], str(int((ids >= 0).sum())), size, f"{float(bank.mass[index]):.3f}", target

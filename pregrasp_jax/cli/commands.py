@@ -13,16 +13,17 @@ from pregrasp_jax.assets.meshes import Refusal, load_object_dir
 from pregrasp_jax.assets.sets import format_table
 from pregrasp_jax.cli import doctor as machine_doctor
 from pregrasp_jax.cli.evaluate import refuse_unwritable
-from pregrasp_jax.cli.film import draw_decision, draw_scenes
-from pregrasp_jax.cli.player import EvaluationConfig, make_player
-from pregrasp_jax.config import AssetsConfig, Config, ObjectSet, SceneConfig
+from pregrasp_jax.config import AssetsConfig, Config, ObjectSet, SceneConfig, TaskConfig
 from pregrasp_jax.drawing import contact_sheet, save_png
-from pregrasp_jax.env import make_env
 from pregrasp_jax.evaluation import load_evaluation
+from pregrasp_jax.evaluation.player import EvaluationConfig, make_player
+from pregrasp_jax.evaluation.statistics import compare as compare_evaluations
+from pregrasp_jax.evaluation.statistics import format_comparison
+from pregrasp_jax.machine import enable_compilation_cache
+from pregrasp_jax.report.play import draw_decision, draw_scenes
+from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene.bank import SceneBank
-from pregrasp_jax.statistics import compare as compare_evaluations
-from pregrasp_jax.statistics import format_comparison
-from pregrasp_jax.training.program import enable_compilation_cache
+from pregrasp_jax.task.env import make_env
 from pregrasp_jax.types import HullBank
 
 _SHOWN_SCENES = 12
@@ -44,10 +45,11 @@ def assets(
     names: Sequence[ObjectSet] = (object_set,) if object_set else _object_sets(object_dir)
     for name in names:
         bank, refusals = _load_objects(object_dir, name)
+        eligible, why_not = get_robot(TaskConfig().robot).eligibility(bank)
         file = png if len(names) == 1 else png.with_stem(f"{png.stem}-{name}")
-        print(f"{name} ({object_dir or 'built in'})\n{format_table(bank, refusals)}")
+        print(f"{name} ({object_dir or 'built in'})\n{format_table(bank, refusals, why_not)}")
         if bank.names:
-            _write_png(file, contact_sheet(bank))
+            _write_png(file, contact_sheet(bank, eligible))
 
 
 def compare(a: Path, b: Path, /, *, json: Path | None = None) -> None:

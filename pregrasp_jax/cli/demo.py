@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from pregrasp_jax import io
-from pregrasp_jax.cli.film import film_episodes
-from pregrasp_jax.cli.player import EvaluationConfig, Player, make_player, run_evaluation
 from pregrasp_jax.cli.progress import EpisodeProgress
 from pregrasp_jax.cli.report import FILMS, describe_films, play_films, write_page
 from pregrasp_jax.config import PRESETS
 from pregrasp_jax.evaluation import format_evaluations
+from pregrasp_jax.evaluation.player import EvaluationConfig, Player, make_player, run_evaluation
 from pregrasp_jax.report import read_run
+from pregrasp_jax.report.play import film_episodes
 from pregrasp_jax.report.results import EVALUATIONS
 from pregrasp_jax.training.session import resume, train
 

@@ -13,9 +13,8 @@ import jax
 
 import pregrasp_jax
 from pregrasp_jax import io
-from pregrasp_jax.machine import versions
+from pregrasp_jax.machine import CACHE_SWITCH, compilation_cache_dir, versions
 from pregrasp_jax.training import resources
-from pregrasp_jax.training.program import CACHE_SWITCH, compilation_cache_dir
 
 _OPTIONAL = {
     "warp": "engine warp",

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from pregrasp_jax import io
-from pregrasp_jax.cli.film import film_episodes
-from pregrasp_jax.cli.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.cli.progress import EpisodeProgress
 from pregrasp_jax.evaluation import format_evaluation
+from pregrasp_jax.evaluation.player import EvaluationConfig, make_player, run_evaluation
+from pregrasp_jax.report.play import film_episodes
 
 
 def evaluate(

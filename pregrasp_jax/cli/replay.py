@@ -10,19 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax import drawing, grid
+from pregrasp_jax import drawing
 from pregrasp_jax.assets.sets import load_bank_for
 from pregrasp_jax.cli.evaluate import refuse_unwritable
-from pregrasp_jax.cli.film import in_batch
-from pregrasp_jax.env import Env, longest_push
-from pregrasp_jax.heightmap import scene_hulls
-from pregrasp_jax.physics import make_engine
-from pregrasp_jax.physics.base import CTRL_DT
-from pregrasp_jax.primitives import Plan
+from pregrasp_jax.report.play import describe_action, env_hulls, in_batch
 from pregrasp_jax.scene.bank import SceneBank
+from pregrasp_jax.task.env import Env, assemble
+from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training.dump import Dump, load_dump
 from pregrasp_jax.training.mishap import Mishap
-from pregrasp_jax.types import OPEN, REASONS, EnvState, StepResult
+from pregrasp_jax.types import CTRL_DT, REASONS, EnvState, StepResult
 
 
 @dataclass(frozen=True)
@@ -89,9 +86,8 @@ def make_replay_env(dump: Dump, engine: str, object_dir: str | None = None) -> E
             f"{dump.path} is of other objects (hull bank {dump.hull_bank_hash}, {assets.object_dir or 'the built-in'} "
             f"{assets.object_set} objects have {bank.content_hash}); wanted are those of the training: --object-dir"
         )
-    scenes = _one_scene(dump)
-    made = make_engine(engine, bank, threads=config.physics.threads)
-    return Env(task=config.task, bank=bank, scenes=scenes, engine=made, max_distance=longest_push(config))
+    config = dataclasses.replace(config, physics=dataclasses.replace(config.physics, engine=engine))
+    return assemble(config, bank, _one_scene(dump))
 
 
 def make_replay(env: Env) -> Callable[[Mishap], Replay]:
@@ -102,11 +98,11 @@ def make_replay(env: Env) -> Callable[[Mishap], Replay]:
     look, plan, run, conclude = (in_batch(f) for f in (env.look, env.plan, env.engine.run, env.conclude))
 
     def replay(mishap: Mishap) -> Replay:
-        before = look(mishap.state)
+        before = look(mishap.state, mishap.hand)
         planned = plan(before, mishap.action)
-        num_ctrl = jnp.where(planned.reachable, planned.num_ctrl, 0)
+        num_ctrl = planned.num_ctrl
         physics = run(before.physics, planned.ctrl, num_ctrl)
-        after, result = conclude(before, mishap.action, planned.reachable, physics)
+        after, result = conclude(before, planned, physics)
         pairs = zip(jax.tree.leaves(after.physics_obs), jax.tree.leaves(mishap.seen), strict=True)
         return Replay(
             before=before,
@@ -122,13 +118,10 @@ def make_replay(env: Env) -> Callable[[Mishap], Replay]:
 
 def describe_replay(env: Env, dump: Dump, mishap: Mishap, replay: Replay) -> list[str]:
     """Return what was pushed, how it ended, and whether it did so in the training."""
-    row, col, aperture = grid.decode_action(mishap.action)
-    x, y = np.asarray(grid.cell_to_world(row, col))
-    hand = "open" if aperture == OPEN else "closed"
     kind = f"branch {int(mishap.branch)}" if mishap.branch else "the real one"
     ended = "diverged" if replay.result.outcome.diverged else "did not diverge"
     lines = {
-        "push": f"{hand} to x {x:.2f} m, y {y:.2f} m in {replay.duration:.2f} s; number "
+        "push": f"{describe_action(env, int(mishap.action))} in {replay.duration:.2f} s; number "
         f"{int(mishap.state.num_pushes) + 1} of its episode, {kind}",
         "training": f"scene {int(mishap.scene)} at step {int(mishap.env_steps)} on {dump.engine}",
         "reason": f"{REASONS[int(replay.result.reason)]}; the physics {ended}",
@@ -143,16 +136,16 @@ def draw_replay(env: Env, mishap: Mishap, replay: Replay) -> np.ndarray:
     """Return scene | height | segmentation | push before, and the scene afterwards if it is finite."""
     target, before = int(mishap.state.scene.target), replay.before
     tiles = drawing.make_tiles(
-        scene_hulls(env.bank, before.scene, before.physics_obs),
+        env_hulls(env, before),
         before.obs,
         target,
-        p1=tuple(np.asarray(before.p1, float)),
-        mask=np.asarray(env.action_mask(before.p1)),
+        actions=env.primitive.actions,
+        mask=np.asarray(env.action_mask(before.hand)),
         action=int(mishap.action),
     )
     seen = replay.after.physics_obs
     if all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(seen)):
-        hulls = scene_hulls(env.bank, before.scene, seen)
+        hulls = env_hulls(env, replay.after)
         view = drawing.draw_camera(hulls, target_slot=target, camera=drawing.side_view(tiles[0][1].shape[:2]))
         tiles.append(("scene afterwards", view))
     return drawing.make_panel(tiles, title=f"step {int(mishap.env_steps)} | {REASONS[int(replay.result.reason)]}")

@@ -6,8 +6,8 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw
 
-from pregrasp_jax import grid
 from pregrasp_jax.drawing.shaded import instance_colors
+from pregrasp_jax.spaces import grid
 
 
 def draw_heightmap(height: np.ndarray, *, size: int = 300) -> np.ndarray:

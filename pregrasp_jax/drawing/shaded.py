@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax import grid
 from pregrasp_jax.heightmap import Camera, HullInstances, render_pinhole, unproject
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.types import MAX_OBJECTS, ROBOT_ID, TABLE_ID
 
 OBSTACLE_COLORS = np.array(

@@ -8,12 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from pregrasp_jax import grid
 from pregrasp_jax.drawing.maps import draw_heightmap, draw_q_map, draw_segmentation
 from pregrasp_jax.drawing.shaded import draw_camera, look_at, side_view
 from pregrasp_jax.heightmap import HullInstances, object_hulls
 from pregrasp_jax.io import write_bytes
-from pregrasp_jax.types import CLOSED, OPEN, HullBank, Observation
+from pregrasp_jax.spaces.actions import ActionSpace
+from pregrasp_jax.types import HullBank, Observation
+
+_MAX_MAPS = 4
+"""Q maps in one panel."""
 
 _INK, _PAPER = (38, 40, 44), (250, 249, 246)
 """Colours of text and background."""
@@ -24,40 +27,43 @@ def make_tiles(
     obs: Observation,
     target_slot: int,
     *,
-    p1: Sequence[float],
+    actions: ActionSpace,
     mask: np.ndarray,
     q_values: np.ndarray | None = None,
     action: int | None = None,
 ) -> list[tuple[str, np.ndarray]]:
-    """Draw scene, height, segmentation, Q closed, Q open, with the half ring and the chosen push.
+    """Draw scene, height, segmentation, and one Q map per choice, with what is allowed and the chosen push.
 
     Args:
         hulls: what stands on the table (unbatched).
         obs: what the policy sees.
         target_slot: the slot of the target.
-        p1: (x, y) m, where the push starts.
-        mask: [H, W] bool, where it may end.
-        q_values: [H, W, 2], or None for a policy without Q-values.
-        action: flat index of the chosen push, drawn on the map of its aperture.
+        actions: what an action means; of more than `_MAX_MAPS` choices the best are drawn, the chosen one among them.
+        mask: [H, W, K] bool, which actions are allowed.
+        q_values: [H, W, K], or None for a policy without Q-values.
+        action: flat index of the chosen push, drawn on the map of its choice.
 
     Returns:
         (caption, image [rows, columns, 3] uint8) of each.
     """
-    push_aperture, push = None, None
+    taken, push = None, None
     if action is not None:
-        row, col, push_aperture = (int(x) for x in grid.decode_action(jnp.int32(action)))
-        push = p1, np.asarray(grid.cell_to_world(jnp.int32(row), jnp.int32(col))).tolist()
-    values = np.zeros((*np.shape(mask), 2)) if q_values is None else np.asarray(q_values)
-    allowed = values[np.asarray(mask, bool)]
+        end, taken = actions.decode(np.int32(action))
+        push = np.asarray(obs.hand.xy).tolist(), end.tolist()
+    mask = np.asarray(mask, bool)
+    values = np.zeros(mask.shape) if q_values is None else np.asarray(q_values)
+    allowed = values[mask]
     limits = (allowed.min(), allowed.max()) if allowed.size else (0.0, 1.0)
     scene = draw_camera(hulls, target_slot=target_slot, camera=side_view((300, 400)))
     tiles = [("scene", scene), ("height, 0 to 0.30 m", draw_heightmap(np.asarray(obs.height)))]
     tiles.append(("segmentation", draw_segmentation(np.asarray(obs.instance_ids), target_slot=target_slot)))
-    for aperture, name in ((CLOSED, "closed"), (OPEN, "open")):
-        chosen = push if aperture == push_aperture else None
-        image = draw_q_map(values[..., aperture], mask, push=chosen, limits=limits, backdrop=np.asarray(obs.height))
+    best = np.where(mask, values, -np.inf).max(axis=(0, 1))
+    first = np.argsort(-np.where(np.arange(len(best)) == taken, np.inf, best), kind="stable")[:_MAX_MAPS]
+    for choice in sorted(first):
+        chosen, shown = push if choice == taken else None, mask[..., choice]
+        image = draw_q_map(values[..., choice], shown, push=chosen, limits=limits, backdrop=np.asarray(obs.height))
         span = "" if q_values is None else f" {limits[0]:.2f} to {limits[1]:.2f}"
-        tiles.append((f"{'push' if q_values is None else 'Q'} {name}{span}", image))
+        tiles.append((f"{'push' if q_values is None else 'Q'} {actions.choices[choice].name}{span}", image))
     return tiles
 
 
@@ -66,8 +72,8 @@ def make_panel(tiles: Sequence[tuple[str, np.ndarray]], *, title: str = "") -> n
     return _row(tiles, title=title, footer="maps: seen from above, +x right, +y up")
 
 
-def contact_sheet(bank: HullBank, *, columns: int = 6) -> np.ndarray:
-    """Draw every object of a bank with its name, size, mass, and whether it may be a target."""
+def contact_sheet(bank: HullBank, eligible: np.ndarray, *, columns: int = 6) -> np.ndarray:
+    """Draw every object of a bank with its name, size, mass, and whether it may be a target, `eligible` [N] bool."""
     tiles = []
     for index, name in enumerate(bank.names):
         pose = jnp.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
@@ -76,11 +82,11 @@ def contact_sheet(bank: HullBank, *, columns: int = 6) -> np.ndarray:
         wide, deep, high = np.ptp(points, axis=0)
         view = look_at((0.25, -0.62, 0.42), (0.0, 0.0, 0.115), fovy=np.deg2rad(27.0), shape=(220, 220))
         image = draw_camera(hulls, camera=view)
-        eligible = "target or obstacle" if bool(np.asarray(bank.eligible)[index]) else "obstacle only"
+        role = "target or obstacle" if eligible[index] else "obstacle only"
         size = f"{wide * 100:.1f} x {deep * 100:.1f} x {high * 100:.1f} cm"
         pieces = int(np.asarray(hulls.present).sum())
         mass = f"{float(np.asarray(bank.mass)[index]):.2f} kg, {pieces} hull{'s' if pieces > 1 else ''}"
-        tiles.append((f"{name}\n{size}\n{mass}\n{eligible}", image))
+        tiles.append((f"{name}\n{size}\n{mass}\n{role}", image))
     rows = [_row(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
     width = max(row.shape[1] for row in rows)
     return np.concatenate([np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=250) for r in rows])

@@ -10,10 +10,8 @@ import numpy as np
 
 from pregrasp_jax import io
 from pregrasp_jax.config import Config, to_dict
-from pregrasp_jax.judge import TARGET_IN_REGION
+from pregrasp_jax.evaluation.statistics import is_interval, is_number, wilson_interval
 from pregrasp_jax.machine import versions
-from pregrasp_jax.statistics import is_interval, is_number, wilson_interval
-from pregrasp_jax.types import REASONS
 
 FORMAT = "pregrasp_jax evaluation 1"
 """Marks an evaluation file, so that a foreign JSON is not taken for one."""
@@ -35,6 +33,7 @@ class Episode:
         target: name of the target object.
         reason: why it ended: `target_in_region` (and grasped, if a grasp was asked for), `grasp_failed`, or
             another of `types.REASONS`.
+        success: whether the episode counts as one.
         motions: executed pushes; one that was refused as unreachable before the hand moved is not a motion.
         return_: sum of rewards, undiscounted.
         seconds: s, time the robot spent on its motions.
@@ -44,15 +43,11 @@ class Episode:
     scene: int
     target: str
     reason: str
+    success: bool
     motions: int
     return_: float
     seconds: float
     overflows: int = 0
-
-    @property
-    def success(self) -> bool:
-        """Whether the episode counts as a success."""
-        return self.reason == REASONS[TARGET_IN_REGION]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the row of the evaluation file."""
@@ -137,6 +132,9 @@ def evaluation_document(
         "physics": config.physics.engine,
         "object_set": config.assets.object_set,
         "camera": config.task.camera,
+        "workspace": config.task.workspace,
+        "robot": config.task.robot,
+        "primitive": config.task.primitive,
         "episodes": len(result.episodes),
         "seed": seed,
         **result.summary(),

@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from pregrasp_jax.env import Env
 from pregrasp_jax.evaluation.results import GRASP_FAILED, Episode, EvaluationResult
-from pregrasp_jax.judge import RUNNING, TARGET_IN_REGION
-from pregrasp_jax.policies import Policy
-from pregrasp_jax.primitives import APERTURE_TIME, SETTLE_TIME
+from pregrasp_jax.policies.scripts import Policy
+from pregrasp_jax.task.env import Env
+from pregrasp_jax.task.primitive import Plan
+from pregrasp_jax.task.rules import RUNNING
+from pregrasp_jax.task.stages import Stages, make_stages
 from pregrasp_jax.types import REASONS, EnvState, GraspResult
 
 Progress = Callable[[int, int, int], None]
@@ -59,8 +60,9 @@ class Evaluator:
         self._num_envs = max(num_envs, MIN_BATCH)
         self._start = jax.jit(jax.vmap(self._start_one))
         self._restart = jax.jit(jax.vmap(self._restart_one))
-        self._push = jax.jit(jax.vmap(self._push_one, in_axes=(None, 0, None)))
-        self._grasp = jax.jit(jax.vmap(env.grasp))
+        decide = jax.vmap(self._decide_one, in_axes=(None, 0, None))
+        self._push = make_stages(env.engine, decide, jax.vmap(self._conclude_one))
+        self._grasp = make_stages(env.engine, jax.vmap(self._plan_grasp_one), jax.vmap(self._conclude_grasp_one))
         self._compiled: dict[Hashable, Callable[..., Any]] = {}
 
     def compile(self, policy: Policy, *, episodes: int) -> None:
@@ -111,7 +113,7 @@ class Evaluator:
                 progress(len(finished), episodes, sum(episode.success for episode in finished))
 
         for run in self._run_to_ends(policy, episodes, jax.random.key(seed)):
-            if with_grasp and run.reason == TARGET_IN_REGION:
+            if with_grasp and run.reason in self._env.rules.successes:
                 enclosed.append(run)
             else:
                 finish([self._episode(run)])
@@ -144,11 +146,12 @@ class Evaluator:
         return max(min(self._num_envs, episodes), MIN_BATCH)
 
     def _program(self, function: Any, *args: Any) -> Callable[..., Any]:
-        """Return a jitted function compiled for arguments like these; it is compiled once."""
+        """Return a jitted or staged function compiled for arguments like these; it is compiled once."""
         leaves, structure = jax.tree.flatten(args)
         kind = (function, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
         if kind not in self._compiled:
-            self._compiled[kind] = function.lower(*args).compile()
+            staged = isinstance(function, Stages)
+            self._compiled[kind] = function.compile(*args) if staged else function.lower(*args).compile()
         return self._compiled[kind]
 
     def _call(self, function: Any, *args: Any) -> Any:
@@ -165,14 +168,17 @@ class Evaluator:
 
     def _episode(self, run: _Run, grasp: GraspResult | None = None) -> Episode:
         scene, reason, overflows = run.state.scene, REASONS[int(run.reason)], run.state.physics_obs.overflows
+        success = int(run.reason) in self._env.rules.successes
         if grasp is not None:
-            if not grasp.held:
+            success = bool(grasp.held)
+            if not success:
                 reason = "nan" if grasp.diverged else GRASP_FAILED
             overflows = grasp.overflows
         return Episode(
             scene=int(run.state.scene_index),
             target=self._env.bank.names[int(scene.object_ids[scene.target])],
             reason=reason,
+            success=success,
             motions=int(run.state.num_pushes),
             return_=float(run.return_),
             seconds=float(run.seconds),
@@ -186,21 +192,25 @@ class Evaluator:
         """Return scene `index` if it is not negative, else `run`."""
         return _where(index >= 0, self._start_one(jnp.maximum(index, 0)), run)
 
-    def _push_one(self, policy: Policy, run: _Run, key: jax.Array) -> _Run:
-        """Let the policy decide and push once; an ended run stays as it is."""
+    def _decide_one(self, policy: Policy, run: _Run, key: jax.Array) -> tuple[Any, Plan, Any]:
+        """Let the policy decide, and plan; an ended run stays where it is."""
         state = run.state
         key = jax.random.fold_in(jax.random.fold_in(key, state.scene_index), state.num_pushes)
-        next_state, result = self._env.step(state, policy(state, key))
-        pushed = _Run(
-            next_state, result.reason, run.return_ + result.reward, run.seconds + self._seconds(state, next_state)
-        )
+        plan = self._env.plan(state, policy(state, key)).unless(run.reason != RUNNING, "no_ik")
+        return state.physics, plan, run
+
+    def _conclude_one(self, run: _Run, plan: Plan, physics: Any) -> _Run:
+        """Return the run after a push; an ended run stays as it is."""
+        state, result = self._env.conclude(run.state, plan, physics)
+        pushed = _Run(state, result.reason, run.return_ + result.reward, run.seconds + result.seconds)
         return _where(run.reason == RUNNING, pushed, run)
 
-    def _seconds(self, before: EnvState, after: EnvState) -> jax.Array:
-        """Return the time the robot took from one state to the next, s; 0 if the push was refused."""
-        travel = jnp.linalg.norm(after.p1 - before.p1) / self._env.task.push_speed
-        wait = APERTURE_TIME * (after.aperture != before.aperture)
-        return jnp.where(after.num_pushes > before.num_pushes, travel + wait + SETTLE_TIME, 0.0)
+    def _plan_grasp_one(self, state: EnvState) -> tuple[Any, Plan, Any]:
+        return state.physics, self._env.plan_grasp(state), state
+
+    def _conclude_grasp_one(self, state: EnvState, plan: Plan, physics: Any) -> GraspResult:
+        del plan
+        return self._env.conclude_grasp(state, physics)
 
 
 def evaluate_policy(

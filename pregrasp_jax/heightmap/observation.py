@@ -4,11 +4,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax import grid
+from pregrasp_jax.assets.hulls import make_hulls
 from pregrasp_jax.geometry import transform_planes, transform_points
 from pregrasp_jax.heightmap.views import Camera, HullInstances, orthographic, pinhole
-from pregrasp_jax.robot import description, links
-from pregrasp_jax.types import ROBOT_ID, TABLE_ID, HullBank, Hulls, Observation, PhysicsObservation, SceneParams
+from pregrasp_jax.robot.base import Robot
+from pregrasp_jax.robot.links import pose_to_matrix
+from pregrasp_jax.scene.spec import table_model
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.spaces.workspace import TABLE, Workspace
+from pregrasp_jax.types import (
+    FULL_TOPOLOGY,
+    ROBOT_ID,
+    TABLE_ID,
+    HandPose,
+    HullBank,
+    Hulls,
+    Observation,
+    PhysicsObservation,
+    SceneParams,
+)
 
 SEGMENTATION = {"table": 0, "obstacle": 1, "target": 2, "robot": 3}
 """Pixel values of the fused segmentation (Sec. III-B)."""
@@ -17,28 +31,43 @@ _MIN_STD = 1e-3
 """m; floor of the standard deviation, so that an empty table gives zeros."""
 
 
-def scene_hulls(bank: HullBank, scene: SceneParams, physics_obs: PhysicsObservation) -> HullInstances:
-    """Place the hulls of all objects and robot links in the world.
+def scene_hulls(
+    bank: HullBank, robot: Robot, scene: SceneParams, physics_obs: PhysicsObservation, workspace: Workspace = TABLE
+) -> HullInstances:
+    """Place the hulls of all objects, robot links and walls in the world.
 
     Args:
         bank: the objects.
+        robot: who moves.
         scene: which object is in which slot (unbatched).
         physics_obs: where objects and joints are now.
+        workspace: its walls are drawn with the id of the table.
 
     Returns:
-        K = MAX_OBJECTS * MAX_HULLS + number of robot hulls, in this order.
+        K = MAX_OBJECTS * MAX_HULLS + number of robot hulls + number of walls, in this order.
     """
-    of_objects = object_hulls(bank, scene.object_ids, physics_obs.object_poses)
-    of_robot = robot_hulls(physics_obs.joint_pos)
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts), of_objects, of_robot)
+    parts = [
+        object_hulls(bank, scene.object_ids, physics_obs.object_poses),
+        robot_hulls(robot, physics_obs.joint_pos),
+        *([wall_hulls(workspace)] if workspace.walls else []),
+    ]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
-def robot_hulls(joint_pos: jax.Array) -> HullInstances:
-    """Place the hulls of all robot links in the world, for joint angles [8] rad as in `PhysicsObservation`."""
-    with jax.ensure_compile_time_eval():  # the first call, perhaps under a trace, fills a cache that outlives it
-        hulls, link = links.robot_hulls()
-    planes, vertices = _place(hulls, links.link_poses(joint_pos)[link])
-    labels, present = jnp.full(len(link), ROBOT_ID, jnp.uint8), jnp.ones(len(link), bool)
+def robot_hulls(robot: Robot, joint_pos: jax.Array) -> HullInstances:
+    """Place the hulls of all robot links in the world, for joint positions [J] as in `PhysicsObservation`."""
+    links = robot.links
+    planes, vertices = _place(jax.tree.map(jnp.asarray, links.hulls), links.poses(joint_pos)[links.hull_links])
+    labels, present = jnp.full(len(planes), ROBOT_ID, jnp.uint8), jnp.ones(len(planes), bool)
+    return HullInstances(planes=planes, vertices=vertices, labels=labels, present=present)
+
+
+def wall_hulls(workspace: Workspace) -> HullInstances:
+    """Return the walls of a place, at least one."""
+    hulls = make_hulls([wall.corners() for wall in workspace.walls], FULL_TOPOLOGY)
+    count = len(workspace.walls)
+    labels, present = jnp.full(count, TABLE_ID, jnp.uint8), jnp.ones(count, bool)
+    planes, vertices = (jnp.asarray(np.asarray(rows), jnp.float32) for rows in (hulls.planes, hulls.vertices))
     return HullInstances(planes=planes, vertices=vertices, labels=labels, present=present)
 
 
@@ -55,12 +84,12 @@ def object_hulls(bank: HullBank, object_ids: jax.Array, poses: jax.Array) -> Hul
     return HullInstances(planes=planes, vertices=vertices, labels=labels, present=present.ravel())
 
 
-def observe(hulls: HullInstances, p1: jax.Array, *, camera: str | Camera = "orthographic") -> Observation:
-    """Return what a policy is told: what a camera sees, and where the hand was sent.
+def observe(hulls: HullInstances, hand: HandPose, *, camera: str | Camera = "orthographic") -> Observation:
+    """Return what a policy is told: what a camera sees, and where the hand has been sent.
 
     Args:
         hulls: what stands on the table, robot included (unbatched), from `scene_hulls`.
-        p1: [2] m, commanded end of the last push.
+        hand: commanded end of the last push.
         camera: ``orthographic``, ``pinhole`` for the overhead camera of the MJCF, or a pinhole camera.
 
     Raises:
@@ -74,14 +103,14 @@ def observe(hulls: HullInstances, p1: jax.Array, *, camera: str | Camera = "orth
         height, instance_ids = orthographic(hulls)
     else:
         raise ValueError(f"camera '{camera}' is unknown; allowed are orthographic, pinhole, or a heightmap.Camera")
-    return Observation(height=grid.quantize_height(height), instance_ids=instance_ids, p1=p1)
+    return Observation(height=grid.quantize_height(height), instance_ids=instance_ids, hand=hand)
 
 
 def overhead_camera() -> Camera:
     """Return the camera ``overhead`` of the MJCF, 640 x 480 pixels."""
-    mj_model = description.robot_model()
+    mj_model = table_model()
     camera = mj_model.camera("overhead")
-    pose = description.pose_to_matrix(camera.pos, camera.quat)
+    pose = pose_to_matrix(camera.pos, camera.quat)
     columns, rows = (int(pixels) for pixels in mj_model.cam_resolution[camera.id])
     return Camera(
         position=jnp.asarray(pose[:3, 3], jnp.float32),

@@ -4,8 +4,8 @@ import flax.struct as struct
 import jax
 import jax.numpy as jnp
 
-from pregrasp_jax import grid
 from pregrasp_jax.heightmap.rasterizer import PixelHulls, decode_key, encode_key, rasterize
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.types import TABLE_ID
 
 HEIGHT_LIMIT = 2.0

@@ -16,11 +16,11 @@ import flax.struct as struct
 import jax
 import jax.numpy as jnp
 
-from pregrasp_jax import grid
 from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.heightmap import SEGMENTATION, network_input
 from pregrasp_jax.learning.networks import Conv, upsample
-from pregrasp_jax.types import Observation
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.types import HandPose, Observation
 
 PATCH = 4
 """Cells per side of what the network takes for one position."""
@@ -83,24 +83,24 @@ def look_around_hand(obs: Observation, target_slot: jax.Array, *, size: WindowSi
     """
     images = network_input(obs, target_slot)
     images = jnp.concatenate([images, jnp.ones_like(images[..., :1])], axis=-1)
-    origin = _window_origin(obs.p1, size)
+    origin = _window_origin(obs.hand, size)
     rows, cols = size.shape
     padded = jnp.pad(images, ((rows, rows), (cols, cols), (0, 0)))
     start = (origin[0] + rows, origin[1] + cols, jnp.int32(0))
     return Window(jax.lax.dynamic_slice(padded, start, (rows, cols, 3)), origin)
 
 
-def cells_around_hand(p1: jax.Array, *, size: WindowSize) -> jax.Array:
-    """Return the cells [H, W] bool that the network values, mirrored or not, when the hand is at p1 [2]."""
+def cells_around_hand(hand: HandPose, *, size: WindowSize) -> jax.Array:
+    """Return the cells [H, W] bool that the network values, mirrored or not, for a pose of the hand."""
     rows, cols = size.shape
     inner = jnp.ones((rows - 2, cols, 1), bool)  # the last row has no value, nor has that of the mirror image
-    return paste(inner, _window_origin(p1, size) + jnp.array([1, 0]))[..., 0]
+    return paste(inner, _window_origin(hand, size) + jnp.array([1, 0]))[..., 0]
 
 
-def _window_origin(p1: jax.Array, size: WindowSize) -> jax.Array:
+def _window_origin(hand: HandPose, size: WindowSize) -> jax.Array:
     """Return row and col [2] int32 of the grid where the window begins."""
     # Positions of the hand are cell centres, and the start lies on a corner of cells.
-    row, col = grid.world_to_cell(p1 + 0.01 * grid.HEIGHTMAP_RESOLUTION)
+    row, col = grid.world_to_cell(hand.xy + 0.01 * grid.HEIGHTMAP_RESOLUTION)
     return jnp.stack([row - size.beside, col - size.behind])
 
 
@@ -123,11 +123,13 @@ class CompactNetwork(nn.Module):
     """Q-values of the pushes inside a window around the hand.
 
     Attributes:
+        num_choices: K, values per cell.
         channels: of every layer.
         blocks: residual blocks.
         initial_bias: Q-value of every push before training.
     """
 
+    num_choices: int = 2
     channels: int = 32
     blocks: int = 5
     initial_bias: float = 0.0
@@ -140,23 +142,22 @@ class CompactNetwork(nn.Module):
             window: of B scenes.
 
         Returns:
-            [B, H, W, 2] float32, last axis closed, open; 0 for pushes that end outside the window.
+            [B, H, W, K] float32; 0 for pushes that end outside the window.
         """
         return jax.vmap(paste)(self._q_of_window(window), window.origin)
 
     @nn.compact
-    def q_of_action(self, window: Window, action: jax.Array) -> jax.Array:
-        """Evaluate the taken actions [B] (flat indices) only: ``self(window)`` flattened and gathered, [B]."""
+    def q_at(self, window: Window, row: jax.Array, col: jax.Array) -> jax.Array:
+        """Return ``self(window)[b, row[b], col[b]]``, [B, K], for rows and cols [B] int32 of the grid."""
         q = self._q_of_window(window)
-        row, col, aperture = grid.decode_action(action)
         row, col = row - window.origin[:, 0], col - window.origin[:, 1]
         rows, cols = q.shape[1:3]
         inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
-        taken = q[jnp.arange(len(action)), jnp.clip(row, 0, rows - 1), jnp.clip(col, 0, cols - 1), aperture]
-        return jnp.where(inside, taken, 0.0)
+        taken = q[jnp.arange(len(row)), jnp.clip(row, 0, rows - 1), jnp.clip(col, 0, cols - 1)]
+        return jnp.where(inside[:, None], taken, 0.0)
 
     def _q_of_window(self, window: Window) -> jax.Array:
-        """Return [B, R - 1, C, 2]: the last row completes no patch, it is there for the mirror image."""
+        """Return [B, R - 1, C, K]: the last row completes no patch, it is there for the mirror image."""
         window = window.replace(images=window.images[:, :-1])
         x = window.images
         assert x.ndim == 4 and x.shape[-1] == 3, f"expected [B, R, C, 3], got {x.shape}"
@@ -169,7 +170,7 @@ class CompactNetwork(nn.Module):
             # Zero at first: a network of identities learns from the first update on.
             x = nn.relu(x + Conv(self.channels, 3, nn.initializers.zeros, float32, name=f"block{i}_out")(hidden))
         small = nn.initializers.variance_scaling(1e-4, "fan_in", "normal")
-        q = Conv(2, 1, small, float32, nn.initializers.constant(self.initial_bias), name="readout")(x)
+        q = Conv(self.num_choices, 1, small, float32, nn.initializers.constant(self.initial_bias), name="readout")(x)
         for _ in range(int(math.log2(PATCH))):
             q = upsample(q)
         return q

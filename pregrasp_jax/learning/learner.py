@@ -1,10 +1,11 @@
 """Q-learning on pushes: TD target, Huber loss through one pixel, Adam, polyak-averaged target network (Sec. III-E).
 
 The TD functions describe ONE transition and return its error, which is what prioritized replay needs; the learner
-vmaps, weights and averages. Nothing here knows the half ring: ``mask_fn(p1 [2]) -> [H, W] bool`` comes as an argument.
+vmaps, weights and averages. Nothing here knows which actions are allowed: ``mask_fn`` comes as an argument.
 """
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import flax.struct as struct
@@ -12,22 +13,14 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from pregrasp_jax.judge import APPROACH_REWARD, IN_REGION_REWARD
+from pregrasp_jax.config import LearnerConfig, ReplayConfig
 from pregrasp_jax.learning import replay as replay_lib
-from pregrasp_jax.learning.replay import Batch, InputFn, Replay
+from pregrasp_jax.learning.q_function import Params, QFunction
+from pregrasp_jax.learning.replay import Batch, Replay
+from pregrasp_jax.types import HandPose
 
-Params = Any
-ApplyFn = Callable[[Params, jax.Array], jax.Array]
-"""``(params, inputs [B, H, W, 2]) -> q [B, H, W, 2]``."""
-
-QAtFn = Callable[[Params, jax.Array, jax.Array], jax.Array]
-"""``(params, inputs [B, H, W, 2], action [B]) -> q [B]`` of the taken actions."""
-
-AugmentFn = Callable[[jax.Array, Any, jax.Array], tuple[Any, jax.Array]]
-"""``(key, inputs of B scenes, action [B]) -> the same of equivalent scenes``."""
-
-MaskFn = Callable[[jax.Array], jax.Array]
-"""``p1 [2] -> [H, W] bool``, the cells where the next push may end."""
+MaskFn = Callable[[HandPose], jax.Array]
+"""``hand -> [H, W, K] bool``, the actions that are allowed next."""
 
 
 class LearnerState(struct.PyTreeNode):
@@ -56,8 +49,8 @@ def greedy_action(q: jax.Array, mask: jax.Array) -> jax.Array:
     """Return the flat index () int32 of the best allowed push; 0 if the mask is empty.
 
     Args:
-        q: [H, W, 2].
-        mask: [H, W] bool.
+        q: [H, W, K].
+        mask: [H, W, K] bool.
     """
     return jnp.argmax(_mask(q, mask)).astype(jnp.int32)
 
@@ -66,8 +59,8 @@ def max_q(q: jax.Array, mask: jax.Array) -> jax.Array:
     """Return the value () of the best allowed push, hence of a state; 0 if the mask is empty.
 
     Args:
-        q: [H, W, 2].
-        mask: [H, W] bool.
+        q: [H, W, K].
+        mask: [H, W, K] bool.
 
     Source: Eq. 3.
     """
@@ -75,8 +68,8 @@ def max_q(q: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def _mask(q: jax.Array, mask: jax.Array) -> jax.Array:
-    assert q.ndim == 3 and q.shape[:2] == mask.shape, f"expected [H, W, 2] and [H, W], got {q.shape}, {mask.shape}"
-    return jnp.where(mask[..., None], q, -jnp.inf)
+    assert q.ndim == 3 and q.shape == mask.shape, f"expected [H, W, K] twice, got {q.shape}, {mask.shape}"
+    return jnp.where(mask, q, -jnp.inf)
 
 
 def td_target(reward: jax.Array, terminated: jax.Array, value: jax.Array, *, discount: float) -> jax.Array:
@@ -99,61 +92,49 @@ def huber(error: jax.Array, *, delta: float) -> jax.Array:
     return jnp.where(magnitude <= delta, 0.5 * magnitude**2, delta * (magnitude - 0.5 * delta))
 
 
-def gather_q(apply_fn: ApplyFn) -> QAtFn:
-    """Return a `QAtFn` that evaluates the whole grid and reads one pixel of it; right for any network."""
-
-    def q_at(params: Params, inputs: jax.Array, action: jax.Array) -> jax.Array:
-        q = apply_fn(params, inputs)
-        return jnp.take_along_axis(q.reshape(q.shape[0], -1), action[:, None], axis=1)[:, 0]
-
-    return q_at
-
-
 def update(
     state: LearnerState,
     batch: Batch,
     *,
-    apply_fn: ApplyFn,
+    q: QFunction,
     mask_fn: MaskFn,
+    successes: Sequence[int],
     optimizer: optax.GradientTransformation,
-    q_at_fn: QAtFn | None = None,
-    discount: float = 0.5,
-    polyak: float = 0.999,
-    huber_delta: float = 0.1,
+    config: LearnerConfig,
 ) -> tuple[LearnerState, jax.Array, dict[str, jax.Array]]:
     """Take one gradient step.
 
     Args:
         state: what changes.
         batch: B transitions; the gradient of each flows through the pixel of its action only.
-        apply_fn: the network on the whole grid.
-        mask_fn: the half ring.
-        optimizer: Adam with step size 1e-4 in the paper.
-        q_at_fn: the network at the taken actions, if there is a cheaper way than `gather_q(apply_fn)`.
-        discount: gamma.
-        polyak: share of the target network that is kept.
-        huber_delta: where the loss turns linear.
+        q: the network.
+        mask_fn: which actions are allowed.
+        successes: reasons that count as success.
+        optimizer: see `training.learn.make_optimizer`.
+        config: discount, polyak, loss.
 
     Returns:
         The next state, TD errors [B] (signed) for the priorities, and metrics () each.
     """
-    q_at = q_at_fn or gather_q(apply_fn)
-    targets = _targets(state, batch, apply_fn=apply_fn, mask_fn=mask_fn, discount=discount)
+    masks = jax.vmap(mask_fn)(batch.next_hand)
+    values = jax.vmap(max_q)(q.apply(state.target_params, batch.next_inputs), masks)
+    discounted = functools.partial(td_target, discount=config.discount)
+    targets = jax.vmap(discounted)(batch.reward, batch.terminated, values)
 
     def loss_fn(params: Params) -> tuple[jax.Array, jax.Array]:
-        errors = jax.vmap(td_error)(q_at(params, batch.inputs, batch.action), targets)
-        return jnp.mean(batch.importance_weights * huber(errors, delta=huber_delta)), errors
+        errors = jax.vmap(td_error)(q.at(params, batch.inputs, batch.action), targets)
+        return jnp.mean(batch.importance_weights * huber(errors, delta=config.huber_delta)), errors
 
     (loss, errors), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.params)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
     params = optax.apply_updates(state.params, updates)
     next_state = LearnerState(
         params=params,
-        target_params=optax.incremental_update(params, state.target_params, 1.0 - polyak),
+        target_params=optax.incremental_update(params, state.target_params, 1.0 - config.polyak),
         opt_state=opt_state,
         gradient_steps=state.gradient_steps + 1,
     )
-    return next_state, errors, _metrics(batch, loss, errors, targets, grads)
+    return next_state, errors, _metrics(batch, loss, errors, targets, grads, successes)
 
 
 def learn(
@@ -161,11 +142,10 @@ def learn(
     replay: Replay,
     key: jax.Array,
     *,
-    batch_size: int,
-    input_fn: InputFn,
+    q: QFunction,
     importance_exponent: jax.Array | float,
-    priority_exponent: float,
-    augment_fn: AugmentFn = lambda key, inputs, action: (inputs, action),
+    replay_config: ReplayConfig,
+    config: LearnerConfig,
     split_fn: Callable[[Batch], Batch] = lambda batch: batch,
     **update_options: Any,
 ) -> tuple[LearnerState, Replay, dict[str, jax.Array]]:
@@ -175,37 +155,39 @@ def learn(
         state: of the learner.
         replay: at least one row must be alive.
         key: consumed.
-        batch_size: B.
-        input_fn: see `replay.sample`.
+        q: the network, its input, and what is equivalent to it.
         importance_exponent: beta, 0.4 -> 1 over training.
-        priority_exponent: alpha.
-        augment_fn: changes what is learned from to something equivalent.
+        replay_config: alpha.
+        config: batch size, and what `update` takes of it.
         split_fn: returns the same batch, spread over several devices.
-        **update_options: keyword arguments of `update`.
+        **update_options: further keyword arguments of `update`.
     """
     sample_key, augment_key = jax.random.split(key)
     batch = replay_lib.sample(
-        replay, sample_key, batch_size=batch_size, importance_exponent=importance_exponent, input_fn=input_fn
+        replay,
+        sample_key,
+        batch_size=config.batch_size,
+        importance_exponent=importance_exponent,
+        input_fn=q.input_fn,
     )
     batch = split_fn(batch)
-    inputs, action = augment_fn(augment_key, batch.inputs, batch.action)
+    inputs, action = q.augment(augment_key, batch.inputs, batch.action)
     batch = batch.replace(inputs=inputs, action=action)
-    state, errors, metrics = update(state, batch, **update_options)
-    replay = replay_lib.set_priorities(replay, batch.rows, errors, priority_exponent=priority_exponent)
-    return state, replay, metrics
-
-
-def _targets(state: LearnerState, batch: Batch, *, apply_fn: ApplyFn, mask_fn: MaskFn, discount: float) -> jax.Array:
-    """Return y [B]."""
-    masks = jax.vmap(mask_fn)(batch.next_p1)
-    values = jax.vmap(max_q)(apply_fn(state.target_params, batch.next_inputs), masks)
-    return jax.vmap(lambda r, t, v: td_target(r, t, v, discount=discount))(batch.reward, batch.terminated, values)
+    state, errors, metrics = update(state, batch, q=q, config=config, **update_options)
+    exponent = replay_config.priority_exponent
+    return state, replay_lib.set_priorities(replay, batch.rows, errors, priority_exponent=exponent), metrics
 
 
 def _metrics(
-    batch: Batch, loss: jax.Array, errors: jax.Array, targets: jax.Array, grads: Params
+    batch: Batch,
+    loss: jax.Array,
+    errors: jax.Array,
+    targets: jax.Array,
+    grads: Params,
+    successes: Sequence[int],
 ) -> dict[str, jax.Array]:
-    succeeded, approached = batch.reward == IN_REGION_REWARD, batch.reward == APPROACH_REWARD
+    succeeded = jnp.any(batch.reason[:, None] == jnp.array(successes)[None], axis=-1)
+    approached = ~succeeded & (batch.reward > 0)
     return {
         "train/loss": loss,
         "train/td_error": jnp.mean(jnp.abs(errors)),

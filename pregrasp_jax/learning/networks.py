@@ -1,10 +1,10 @@
 """The fully convolutional Q-network of the paper's Fig. 3, evaluated on the whole grid or at one pixel.
 
 Per input image RB(32); concatenated, C(3,64) - MP - RB(128) - MP - RB(256) - RB(512) - RB(256) - RB(128) - UP - RB(64)
-- UP - C(1,2). The grid shrinks 100 -> 50 -> 25 and grows back. Two identities make it faster on a CPU without changing
+- UP - C(1,K). The grid shrinks 100 -> 50 -> 25 and grows back. Two identities make it faster on a CPU without changing
 the function:
 
-* C(1,2) comes before the last UP: a 1x1 convolution commutes with an interpolation whose weights sum to 1.
+* C(1,K) comes before the last UP: a 1x1 convolution commutes with an interpolation whose weights sum to 1.
 * The loss looks at a single pixel, so `QNetwork.q_at` computes only that pixel's receptive field below the second MP.
 """
 
@@ -142,13 +142,15 @@ class QNetwork(nn.Module):
     """Q-values of all pushes from a heightmap and a segmentation.
 
     Attributes:
+        num_choices: K, values per cell.
         width: factor on all channel counts; 1.0 is the paper (7.37 M parameters).
         dtype: of the computation (float32 or bfloat16); parameters and Q-values are float32.
         initial_bias: Q-value of every push before training, up to a few hundredths.
 
-    Source: Fig. 3; its C(1,1) is C(1,2), one map per aperture.
+    Source: Fig. 3; its C(1,1) is C(1,K), one map per choice: closed and open.
     """
 
+    num_choices: int = 2
     width: float = 1.0
     dtype: jnp.dtype = jnp.float32
     initial_bias: float = 0.0
@@ -166,7 +168,7 @@ class QNetwork(nn.Module):
         self.deep = [ResidualBlock(channels(c), self.dtype) for c in (256, 512, 256, 128)]
         self.up = ResidualBlock(channels(64), self.dtype)
         self.readout = Conv(
-            2,
+            self.num_choices,
             1,
             nn.initializers.variance_scaling(1e-4, "fan_in", "normal"),
             self.dtype,
@@ -180,7 +182,7 @@ class QNetwork(nn.Module):
             x: [H, W, 2] or [B, H, W, 2] float32, normalized height and segmentation / 3; H and W divisible by 4.
 
         Returns:
-            [H, W, 2] or [B, H, W, 2] float32, last axis closed, open.
+            [H, W, K] or [B, H, W, K] float32.
         """
         if x.ndim == 3:
             return self(x[None])[0]
@@ -202,7 +204,7 @@ class QNetwork(nn.Module):
             col: [B] int32.
 
         Returns:
-            [B, 2] float32, closed and open.
+            [B, K] float32.
         """
         height, width = x.shape[1:3]
         rows, cols = _receptive_field(row, height), _receptive_field(col, width)
@@ -216,12 +218,6 @@ class QNetwork(nn.Module):
         inside = _inside(rows.up, rows.half, cols.up, cols.half)
         x = self.readout(self.up.window(x * inside.astype(x.dtype), inside))
         return resample(x, rows.pixel, cols.pixel)[:, 0, 0].astype(jnp.float32)
-
-    def q_of_action(self, x: jax.Array, action: jax.Array) -> jax.Array:
-        """Evaluate the taken actions [B] (flat indices) only: ``self(x)`` flattened and gathered, [B] float32."""
-        cell, aperture = action // 2, action % 2
-        q = self.q_at(x, cell // x.shape[2], cell % x.shape[2])
-        return jnp.take_along_axis(q, aperture[:, None], axis=1)[:, 0]
 
     def _encode(self, x: jax.Array) -> jax.Array:
         """Map [B, H, W, 2] to the [B, H/4, W/4, C] features before RB(256)."""

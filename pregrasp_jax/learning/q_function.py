@@ -9,7 +9,6 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from pregrasp_jax import grid
 from pregrasp_jax.config import NetworkConfig, TaskConfig
 from pregrasp_jax.heightmap import network_input
 from pregrasp_jax.learning.compact import (
@@ -21,7 +20,9 @@ from pregrasp_jax.learning.compact import (
 )
 from pregrasp_jax.learning.networks import QNetwork
 from pregrasp_jax.learning.replay import InputFn
-from pregrasp_jax.types import Observation
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.spaces.actions import ActionSpace
+from pregrasp_jax.types import HandPose, Observation
 
 Params = Any
 
@@ -29,9 +30,9 @@ _COMPACT_CHANNELS = 128
 """Channels of the compact network at width 1."""
 
 
-def everywhere(p1: jax.Array) -> jax.Array:
+def everywhere(hand: HandPose) -> jax.Array:
     """Return the whole grid [H, W] bool."""
-    del p1
+    del hand
     return jnp.ones((grid.GRID_SIZE, grid.GRID_SIZE), bool)
 
 
@@ -40,22 +41,25 @@ class QFunction:
     """A network and its input.
 
     Attributes:
-        network: has ``__call__(inputs) -> [B, H, W, 2]`` and ``q_of_action(inputs, action [B]) -> [B]``.
+        network: has ``__call__(inputs) -> [B, H, W, K]`` and ``q_at(inputs, row [B], col [B]) -> [B, K]``.
+        actions: what an action means, K choices.
         input_fn: (observation, target slot) -> inputs, unbatched.
         mirror_fn: inputs of B scenes -> the same reflected in the robot's plane y = 0. Then a value is the mean of what
             the network says of a scene and of its mirror image; None leaves the network alone.
-        domain_fn: p1 [2] -> [H, W] bool, where a push may end of which the network says anything.
+        domain_fn: hand -> [H, W] bool, where a push may end of which the network says anything.
     """
 
     network: nn.Module
+    actions: ActionSpace
     input_fn: InputFn
     mirror_fn: Callable[[Any], Any] | None = None
-    domain_fn: Callable[[jax.Array], jax.Array] = everywhere
+    domain_fn: Callable[[HandPose], jax.Array] = everywhere
 
     def init(self, key: jax.Array) -> Params:
         """Return initial parameters."""
         blank = jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8)
-        inputs = self.input_fn(Observation(blank, blank, jnp.zeros(2)), jnp.int32(0))
+        hand = HandPose(jnp.zeros(2), *jnp.zeros(3))
+        inputs = self.input_fn(Observation(blank, blank, hand), jnp.int32(0))
         return self.network.init(key, jax.tree.map(lambda leaf: leaf[None], inputs))["params"]
 
     def fits(self, params: Params) -> bool:
@@ -68,40 +72,44 @@ class QFunction:
         return shapes(params) == shapes(expected)
 
     def apply(self, params: Params, inputs: Any) -> jax.Array:
-        """Return the values [B, H, W, 2] of all pushes."""
+        """Return the values [B, H, W, K] of all pushes."""
         q = jnp.asarray(self.network.apply({"params": params}, inputs))
         if self.mirror_fn is None:
             return q
         mirrored = jnp.asarray(self.network.apply({"params": params}, self.mirror_fn(inputs)))
-        return (q + mirrored[:, ::-1]) / 2
+        return (q + self.actions.mirror_map(mirrored)) / 2
 
-    def of_action(self, params: Params, inputs: Any, action: jax.Array) -> jax.Array:
+    def at(self, params: Params, inputs: Any, action: jax.Array) -> jax.Array:
         """Return what the network says of the pushes `action` [B] only, the scenes taken as they are, [B]."""
-        return jnp.asarray(self.network.apply({"params": params}, inputs, action, method="q_of_action"))
+        row, col, choice = self.actions.unravel(action)
+        q = jnp.asarray(self.network.apply({"params": params}, inputs, row, col, method="q_at"))
+        return jnp.take_along_axis(q, choice[:, None], axis=1)[:, 0]
 
     def augment(self, key: jax.Array, inputs: Any, action: jax.Array) -> tuple[Any, jax.Array]:
         """Reflect each of B scenes and its push [B] with probability 1/2, if there is a `mirror_fn`."""
         if self.mirror_fn is None:
             return inputs, action
         mirrored = jax.random.bernoulli(key, shape=action.shape)
-        reflection = self.mirror_fn(inputs), grid.mirror_action(action)
+        reflection = self.mirror_fn(inputs), self.actions.mirror(action)
         choose = jax.vmap(jnp.where, in_axes=(0, 0, 0))
         return jax.tree.map(functools.partial(choose, mirrored), reflection, (inputs, action))
 
     def values(self, params: Params, obs: Observation, target_slot: jax.Array) -> jax.Array:
-        """Return the values [H, W, 2] of all pushes after one observation."""
+        """Return the values [H, W, K] of all pushes after one observation."""
         inputs = self.input_fn(obs, target_slot)
         return self.apply(params, jax.tree.map(lambda leaf: leaf[None], inputs))[0]
 
 
-def make_q_function(network: NetworkConfig, task: TaskConfig) -> QFunction:
-    """Return the Q-function of a configuration."""
+def make_q_function(network: NetworkConfig, task: TaskConfig, actions: ActionSpace) -> QFunction:
+    """Return the Q-function of a configuration, with a value for every choice of `actions`."""
+    common = {"num_choices": actions.num_choices, "initial_bias": network.initial_bias}
     if network.architecture == "paper":
         mirror_fn = mirror_images if network.mirror else None
-        return QFunction(QNetwork(width=network.width, initial_bias=network.initial_bias), network_input, mirror_fn)
+        return QFunction(QNetwork(width=network.width, **common), actions, network_input, mirror_fn)
     channels, size = max(1, round(_COMPACT_CHANNELS * network.width)), window_size(task)
     return QFunction(
-        CompactNetwork(channels=channels, initial_bias=network.initial_bias),
+        CompactNetwork(channels=channels, **common),
+        actions,
         functools.partial(look_around_hand, size=size),
         mirror_window if network.mirror else None,
         functools.partial(cells_around_hand, size=size),

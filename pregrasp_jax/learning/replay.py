@@ -15,10 +15,9 @@ import flax.struct as struct
 import jax
 import jax.numpy as jnp
 
-from pregrasp_jax import grid
 from pregrasp_jax.learning import sum_tree
 from pregrasp_jax.learning.sum_tree import SumTree
-from pregrasp_jax.types import Observation, Outcome
+from pregrasp_jax.types import HandPose, Observation, Outcome
 
 MIN_TD_ERROR = 1e-3
 """Added to |TD error|, so that no transition is forgotten because it was once predicted well."""
@@ -40,6 +39,7 @@ class Steps(struct.PyTreeNode):
         outcome: what the push did.
         reward: [E] float32 for `goal`.
         terminated: [E] bool, the value of the next state is 0.
+        reason: [E] int32 index into `REASONS`.
         truncated: [E] bool, the episode ends but its last state keeps its value.
         next_obs: after the push, before any reset; the next step's `obs` unless the episode ends.
     """
@@ -51,6 +51,7 @@ class Steps(struct.PyTreeNode):
     outcome: Outcome
     reward: jax.Array
     terminated: jax.Array
+    reason: jax.Array
     truncated: jax.Array
     next_obs: Observation
 
@@ -65,6 +66,7 @@ class Rows(struct.PyTreeNode):
         action: int32.
         reward: float32.
         terminated: bool.
+        reason: int32 index into `REASONS`.
         hindsight: bool, `goal` was not the target when the push was made.
         outcome: what the push did, for any goal.
     """
@@ -75,6 +77,7 @@ class Rows(struct.PyTreeNode):
     action: jax.Array
     reward: jax.Array
     terminated: jax.Array
+    reason: jax.Array
     hindsight: jax.Array
     outcome: Outcome
 
@@ -131,7 +134,8 @@ class Batch(struct.PyTreeNode):
         action: [B] int32.
         reward: [B] float32.
         terminated: [B] bool.
-        next_p1: [B, 2] float32 m, commanded end of the push, centre of the next half ring.
+        reason: [B] int32 index into `REASONS`.
+        next_hand: where the hand had been sent after the push; leaves have the leading axis B.
         importance_weights: [B] float32 in (0, 1], largest 1.
         hindsight: [B] bool.
         rows: [B] int32, for `set_priorities`.
@@ -142,7 +146,8 @@ class Batch(struct.PyTreeNode):
     action: jax.Array
     reward: jax.Array
     terminated: jax.Array
-    next_p1: jax.Array
+    reason: jax.Array
+    next_hand: HandPose
     importance_weights: jax.Array
     hindsight: jax.Array
     rows: jax.Array
@@ -180,6 +185,7 @@ def init(steps: Any, *, capacity: int, max_pushes: int) -> Replay:
         action=index,
         reward=jnp.zeros(num_rows),
         terminated=flag,
+        reason=index,
         hindsight=flag,
         outcome=zeros(num_rows, steps.outcome),
     )
@@ -219,6 +225,7 @@ def add(replay: Replay, steps: Steps) -> Replay:
         action=steps.action.astype(jnp.int32),
         reward=steps.reward,
         terminated=steps.terminated,
+        reason=steps.reason.astype(jnp.int32),
         hindsight=jnp.zeros(num_envs, bool),
         outcome=steps.outcome,
     )
@@ -266,7 +273,6 @@ def sample(
     """
     slots = sum_tree.sample(replay.priorities, key, batch_size)
     rows = jax.tree.map(lambda leaf: leaf[slots], replay.rows)
-    row, col, _ = grid.decode_action(rows.action)
 
     def inputs(obs_slots: jax.Array) -> Any:
         images = jax.tree.map(lambda leaf: leaf[obs_slots], replay.observations)
@@ -278,7 +284,8 @@ def sample(
         action=rows.action,
         reward=rows.reward,
         terminated=rows.terminated,
-        next_p1=grid.cell_to_world(row, col),
+        reason=rows.reason,
+        next_hand=jax.tree.map(lambda leaf: leaf[rows.next_obs_slot], replay.observations.hand),
         importance_weights=_importance_weights(replay, slots, importance_exponent),
         hindsight=rows.hindsight,
         rows=slots,

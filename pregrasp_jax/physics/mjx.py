@@ -18,13 +18,13 @@ import mujoco
 from mujoco import mjx
 from mujoco.mjx._src import constraint, forward, scan, smooth, solver
 
-from pregrasp_jax.physics.base import CTRL_DT, MAX_PENETRATION, MAX_SPEED, NUM_CONTROLS, Engine
+from pregrasp_jax.physics.base import MAX_PENETRATION, MAX_SPEED, Engine, refuse_controls
 from pregrasp_jax.physics.hull_collision import ContactCounts, Limits, collide
 from pregrasp_jax.physics.mjx_model import MjxSlotModel, fill_slots, make_mjx_slot_model
-from pregrasp_jax.robot import model as robot
-from pregrasp_jax.robot.kinematics import grasp_pose
+from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.scene.model import parking_poses
-from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, HullBank, PhysicsObservation, SceneParams
+from pregrasp_jax.spaces.workspace import Workspace
+from pregrasp_jax.types import CTRL_DT, MAX_HULLS, MAX_OBJECTS, HullBank, PhysicsObservation, SceneParams
 
 LIMITS = Limits(max_hull_pairs=32, max_robot_pairs=16, max_contact_points=64)
 """Sizes for 8 slots of 6 hulls, from pushes through packed scenes (`python benchmarks/mjx_limits.py`, docs/mjx.md)."""
@@ -60,12 +60,20 @@ class MjxState(struct.PyTreeNode):
 
 
 def make_engine(
-    bank: HullBank, *, num_slots: int = MAX_OBJECTS, num_hulls: int = MAX_HULLS, limits: Limits = LIMITS
+    bank: HullBank,
+    robot: Robot,
+    workspace: Workspace,
+    *,
+    num_slots: int = MAX_OBJECTS,
+    num_hulls: int = MAX_HULLS,
+    limits: Limits = LIMITS,
 ) -> Engine:
     """Compile the slot model of `bank` and return the engine.
 
     Args:
         bank: host hull bank.
+        robot: who moves.
+        workspace: where.
         num_slots: objects that fit; a scene with an object in a later slot counts as diverged.
         num_hulls: hulls per slot.
         limits: sizes of the broadphase.
@@ -73,7 +81,7 @@ def make_engine(
     Raises:
         ValueError: the installed MJX is not supported, or an object has more hulls than a slot.
     """
-    model = make_mjx_slot_model(bank, limits=limits, num_slots=num_slots, num_hulls=num_hulls)
+    model = make_mjx_slot_model(bank, robot, workspace, limits=limits, num_slots=num_slots, num_hulls=num_hulls)
     template = mjx.make_data(model.mjx_model)
     data = mujoco.MjData(model.mj_model)
     robot.set_home(model.mj_model, data)
@@ -106,15 +114,14 @@ def make_engine(
         return reset(None, empty)  # pyright: ignore[reportArgumentType]
 
     def run(state: MjxState, ctrl: jax.Array, num_ctrl: jax.Array) -> MjxState:
-        if ctrl.shape[-1] != NUM_CONTROLS:
-            raise ValueError(f"ctrl must have {NUM_CONTROLS} columns, got {ctrl.shape[-1]}")
+        refuse_controls(ctrl, robot)
         with jax.numpy_rank_promotion("allow"), jax.default_matmul_precision("highest"):
             return run_controls(model, template, state, ctrl, num_ctrl)
 
     def observe(state: MjxState) -> PhysicsObservation:
         poses = parked.at[:num_slots].set(state.qpos[model.qpos_ids])
         joint_pos = state.qpos[joint_ids]
-        return PhysicsObservation(poses, joint_pos, grasp_pose(joint_pos[:6]), state.diverged, state.overflows)
+        return PhysicsObservation(poses, joint_pos, robot.hand_pose(joint_pos), state.diverged, state.overflows)
 
     def coordinates(state: MjxState) -> tuple[jax.Array, jax.Array]:
         return state.qpos, state.qvel
@@ -125,7 +132,7 @@ def make_engine(
 def run_controls(
     model: MjxSlotModel, template: mjx.Data, state: MjxState, ctrl: jax.Array, num_ctrl: jax.Array
 ) -> MjxState:
-    """Advance one scene by `num_ctrl` rows of ctrl [T, NUM_CONTROLS]; see `Engine.run`."""
+    """Advance one scene by `num_ctrl` rows of ctrl [T, A]; see `Engine.run`."""
     m, hull_ids = fill_slots(model, state.object_ids[: model.num_slots])
     substeps = round(CTRL_DT / float(model.mj_model.opt.timestep))
     following = jnp.concatenate([ctrl[1:], ctrl[-1:]])

@@ -18,8 +18,10 @@ from mujoco import mjx
 from pregrasp_jax.physics import native
 from pregrasp_jax.physics.hull_collision import Limits
 from pregrasp_jax.physics.hull_table import HullTable, make_hull_table
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.scene import model as slot_model
+from pregrasp_jax.scene.spec import compile_spec, scene_spec
+from pregrasp_jax.spaces.workspace import Workspace
 from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, HullBank
 
 ITERATIONS, LS_ITERATIONS = 20, 8
@@ -90,9 +92,15 @@ class MjxSlotModel:
 
 
 def make_mjx_slot_model(
-    bank: HullBank, *, limits: Limits, num_slots: int = MAX_OBJECTS, num_hulls: int = MAX_HULLS
+    bank: HullBank,
+    robot: Robot,
+    workspace: Workspace,
+    *,
+    limits: Limits,
+    num_slots: int = MAX_OBJECTS,
+    num_hulls: int = MAX_HULLS,
 ) -> MjxSlotModel:
-    """Compile robot, table and slots for MJX, and tabulate every object.
+    """Compile robot, table, walls and slots for MJX, and tabulate every object.
 
     Raises:
         ValueError: more slots than a scene has, or an object of the bank has no hull or more than a slot holds.
@@ -104,16 +112,16 @@ def make_mjx_slot_model(
         if not 1 <= count <= num_hulls:
             raise ValueError(f"object {name!r} has {count} hulls; a slot of the mjx engine holds 1 to {num_hulls}")
     hulls = make_hull_table(bank.coarse)
-    spec = robot.load_spec()
+    spec = scene_spec(robot, workspace)
     set_options(spec, limits)
     _add_slots(spec, bank, num_slots, num_hulls)
-    mj_model = spec.compile()
+    mj_model = compile_spec(spec)
     bodies = [mj_model.body(f"slot_{i}") for i in range(num_slots)]
     return MjxSlotModel(
         mj_model=mj_model,
         mjx_model=mjx.put_model(mj_model),
         hulls=hulls,
-        objects=_tabulate(bank, hulls, num_hulls),
+        objects=_tabulate(bank, hulls, num_hulls, scene_spec(robot, workspace)),
         limits=limits,
         body_ids=np.array([body.id for body in bodies]),
         geom_ids=np.array([body.geomadr[0] + np.arange(num_hulls) for body in bodies]),
@@ -161,15 +169,19 @@ def _choose_solver(option: Any, geoms: Iterable[Any]) -> None:
             geom.friction[0], geom.solimp[:2] = PAD_FRICTION, PAD_IMPEDANCE
 
 
-def make_reference_model(bank: HullBank, differences: Collection[str] = DIFFERENCES) -> slot_model.SlotModel:
+def make_reference_model(
+    bank: HullBank, robot: Robot, workspace: Workspace, differences: Collection[str] = DIFFERENCES
+) -> slot_model.SlotModel:
     """Return a slot model for C MuJoCo that differs from that of `native` as MJX does, to compare the engine with.
 
     Args:
         bank: host hull bank.
+        robot: who moves.
+        workspace: where.
         differences: which of `DIFFERENCES` to take over.
     """
     hulls = bank.replace(full=bank.coarse) if "hulls" in differences else bank
-    model = slot_model.make_slot_model(native.load_spec(), hulls)
+    model = slot_model.make_slot_model(native.native_spec(robot, workspace), hulls)
     if "awake" in differences:
         model.mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     if "solver" in differences:
@@ -194,13 +206,13 @@ def _add_slots(spec: mujoco.MjSpec, bank: HullBank, num_slots: int, num_hulls: i
             body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname="hull", condim=3)
 
 
-def _tabulate(bank: HullBank, hulls: HullTable, num_hulls: int) -> ObjectTable:
+def _tabulate(bank: HullBank, hulls: HullTable, num_hulls: int, spec: mujoco.MjSpec) -> ObjectTable:
     """Return the table from the native slot model, so that both engines mean the same by an object.
 
     What `mj_setConst` derives it derives here, with one object after the other in the first slot: a free body's
     constants depend on nothing but itself.
     """
-    slots = slot_model.make_slot_model(robot.load_spec(), bank)
+    slots = slot_model.make_slot_model(spec, bank)
     hull_ids = np.vstack([np.asarray(bank.object_hulls)[:, :num_hulls], np.full((1, num_hulls), -1)])
     geom = {
         "geom_pos": np.asarray(hulls.centre)[hull_ids],

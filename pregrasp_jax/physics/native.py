@@ -1,11 +1,11 @@
-"""The `native` engine: MuJoCo's C engine on CPU threads, reached by one host callback per push.
+"""The `native` engine: MuJoCo's C engine on CPU threads, called by the host once per push.
 
-`mujoco.batch.Batch` keeps model fields per simulation, so the callback compares the objects that a scene
-wants with those that are loaded and rewrites only what differs. The dynamic state travels through JAX as
-pairs of uint32 (the bits of MuJoCo's float64), so that x64 stays off and nothing is rounded.
+`mujoco.batch.Batch` keeps model fields per simulation, so a call compares the objects that a scene wants with those
+that are loaded and rewrites only what differs. The dynamic state travels through JAX as pairs of uint32 (the bits of
+MuJoCo's float64), so that x64 stays off and nothing is rounded. Only `run` and `coordinates` leave the device: under
+`jax.jit` they are host callbacks, and whoever divides a step calls `advance` between two compiled programs instead.
 """
 
-import functools
 import threading
 from typing import Any
 
@@ -16,12 +16,13 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from pregrasp_jax.physics.base import CTRL_DT, MAX_PENETRATION, MAX_SPEED, NUM_CONTROLS, Engine
-from pregrasp_jax.robot import model as robot
-from pregrasp_jax.robot.kinematics import grasp_pose
+from pregrasp_jax.physics.base import MAX_PENETRATION, MAX_SPEED, Engine, refuse_controls
+from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.scene import model as slot_model
 from pregrasp_jax.scene.model import SlotModel
-from pregrasp_jax.types import MAX_OBJECTS, HullBank, PhysicsObservation, SceneParams
+from pregrasp_jax.scene.spec import scene_spec
+from pregrasp_jax.spaces.workspace import Workspace
+from pregrasp_jax.types import CTRL_DT, MAX_OBJECTS, HullBank, PhysicsObservation, SceneParams
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
@@ -36,7 +37,7 @@ class NativeState(struct.PyTreeNode):
         bits: [2 * nstate] uint32, mjSTATE_INTEGRATION as pairs.
         object_ids: [MAX_OBJECTS] int32.
         object_poses: [MAX_OBJECTS, 7] float32.
-        joint_pos: [8] float32 rad.
+        joint_pos: [J] float32 rad.
         diverged: () bool.
     """
 
@@ -53,13 +54,14 @@ class Simulations:
     Not for concurrent use by several owners: a lock serialises calls, and evaluation makes its own engine.
     """
 
-    def __init__(self, model: SlotModel, *, threads: int = 0):
+    def __init__(self, model: SlotModel, robot: Robot, *, threads: int = 0):
         slot_model.silence_warnings()
         self.model = model
         self.num_substeps = round(CTRL_DT / model.mj_model.opt.timestep)
         self._threads = threads
         self._lock = threading.Lock()
         self._joint_ids = robot.joint_qpos_ids(model.mj_model)
+        self._set_home = robot.set_home
         self._record = ("sensordata",) if model.mj_model.nsensordata else ()
         self._allocate(1)
 
@@ -98,7 +100,7 @@ class Simulations:
         Args:
             state: [E, nstate] float64.
             object_ids: [E, MAX_OBJECTS] int32.
-            ctrl: [E, T, NUM_CONTROLS] rad.
+            ctrl: [E, T, A] rad.
             num_ctrl: [E] int, at most T.
 
         Returns:
@@ -108,7 +110,7 @@ class Simulations:
         with self._lock:
             self.load(object_ids)
             batch, num_scenes = self._batch, len(state)
-            # Who sleeps is no part of the state: everything is awake at first, whatever was simulated before.
+            # The state does not say which objects sleep: all are awake at first, whatever was simulated before.
             batch.reset(np.arange(num_scenes))
             batch.state[:num_scenes] = state
             batch.warning[:num_scenes] = 0
@@ -134,7 +136,7 @@ class Simulations:
         return new_state, failed | deep | ~(speed < MAX_SPEED) | ~np.isfinite(new_state).all(axis=1)
 
     def describe(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return object poses [E, MAX_OBJECTS, 7] and joint positions [E, 8] float32 of states [E, nstate]."""
+        """Return object poses [E, MAX_OBJECTS, 7] and joint positions [E, J] float32 of states [E, nstate]."""
         qpos = self.coordinates(state)[0].astype(np.float32)
         return qpos[:, self.model.slot_qpos_ids], qpos[:, self._joint_ids]
 
@@ -144,14 +146,13 @@ class Simulations:
         qpos, qvel = (state[..., offset : offset + size] for offset, size in parts)
         return qpos, qvel
 
-    def initial_state(self, object_poses: np.ndarray) -> np.ndarray:
-        """Return states [E, nstate] with objects at rest at poses [E, MAX_OBJECTS, 7] and the robot at the start."""
+    def home_state(self) -> np.ndarray:
+        """Return the state [nstate] with the robot at the start and empty slots parked."""
         mj_model, data = self.model.mj_model, mujoco.MjData(self.model.mj_model)
-        robot.set_home(mj_model, data)
-        template = np.zeros(self.state_size)
-        mujoco.mj_getState(mj_model, data, template, _STATE)
-        state = np.repeat(template[None], len(object_poses), axis=0)
-        self.coordinates(state)[0][:, self.model.slot_qpos_ids] = object_poses
+        self._set_home(mj_model, data)
+        state = np.zeros(self.state_size)
+        mujoco.mj_getState(mj_model, data, state, _STATE)
+        self.coordinates(state)[0][self.model.slot_qpos_ids] = slot_model.parking_poses()
         return state
 
 
@@ -172,13 +173,26 @@ def _from_bits(bits: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(bits).view(np.float64)
 
 
-def load_spec() -> mujoco.MjSpec:
-    """Return the robot at its table, with objects at rest left out of the computation until something touches them.
+def widen_bits(values: jax.Array) -> jax.Array:
+    """Return the bits [..., 2] uint32 (low, high) of float32 values [...] as float64; subnormal numbers become 0.
+
+    The exponent moves from a bias of 127 to one of 1023, and the 23 bits of the fraction to the top of 52.
+    """
+    bits = jax.lax.bitcast_convert_type(values.astype(jnp.float32), jnp.uint32)
+    sign, exponent, fraction = bits & jnp.uint32(1 << 31), (bits >> 23) & 0xFF, bits & 0x7FFFFF
+    widened = jnp.where(exponent == 0xFF, jnp.uint32(0x7FF), exponent + jnp.uint32(1023 - 127))
+    normal = exponent > 0
+    high = sign | jnp.where(normal, (widened << 20) | (fraction >> 3), 0)
+    return jnp.stack([jnp.where(normal, fraction << 29, 0), high], axis=-1)
+
+
+def native_spec(robot: Robot, workspace: Workspace) -> mujoco.MjSpec:
+    """Return the scene, with objects at rest left out of the computation until something touches them.
 
     A sensor tells the signed distance, m, in the deepest contact (0: none). It costs a hundredth of a step and changes
     no bit of the state.
     """
-    spec = robot.load_spec()
+    spec = scene_spec(robot, workspace)
     spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
     spec.add_sensor(
         name="deepest contact",
@@ -190,42 +204,77 @@ def load_spec() -> mujoco.MjSpec:
     return spec
 
 
-def make_engine(bank: HullBank, *, threads: int = 0, model: SlotModel | None = None) -> Engine:
+def make_engine(
+    bank: HullBank, robot: Robot, workspace: Workspace, *, threads: int = 0, model: SlotModel | None = None
+) -> Engine:
     """Compile the slot model of `bank` and return the engine; it owns its simulations.
 
     Args:
         bank: host hull bank.
+        robot: who moves.
+        workspace: where.
         threads: 0 takes every core; results do not depend on it.
         model: a slot model of other hulls or options for the same objects.
     """
-    simulations = Simulations(model or slot_model.make_slot_model(load_spec(), bank), threads=threads)
-    mj_model = simulations.model.mj_model
-    shapes = NativeState(
-        *(
-            jax.ShapeDtypeStruct(shape, dtype)  # pyright: ignore[reportArgumentType]
-            for shape, dtype in (
-                ((2 * simulations.state_size,), jnp.uint32),
-                ((MAX_OBJECTS,), jnp.int32),
-                ((MAX_OBJECTS, 7), jnp.float32),
-                ((8,), jnp.float32),
-                ((), jnp.bool_),
-            )
-        )
+    model = model or slot_model.make_slot_model(native_spec(robot, workspace), bank)
+    native = _Native(Simulations(model, robot, threads=threads), robot)
+    return Engine(
+        name="native",
+        init=native.init,
+        reset=native.reset,
+        run=native.run,
+        observe=native.observe,
+        coordinates=native.coordinates,
+        place=native.place,
+        advance=native.advance,
     )
 
-    def package(state: np.ndarray, object_ids: np.ndarray, diverged: np.ndarray, batch: tuple[int, ...]) -> NativeState:
-        object_poses, joint_pos = simulations.describe(state)
-        leaves = (_to_bits(state), object_ids.astype(np.int32), object_poses, joint_pos, diverged)
-        return NativeState(*(x.reshape((*batch, *x.shape[1:])) for x in leaves))  # pyright: ignore[reportArgumentType]
 
-    def host_reset(object_ids: Any, poses: Any) -> NativeState:
-        object_ids, poses = np.asarray(object_ids), np.asarray(poses)
-        batch = object_ids.shape[:-1]
-        object_ids = object_ids.reshape(-1, MAX_OBJECTS)
-        state = simulations.initial_state(poses.reshape(-1, MAX_OBJECTS, 7))
-        return package(state, object_ids, np.zeros(len(state), bool), batch)
+class _Native:
+    """The functions of the engine, on simulations that they share."""
 
-    def host_run(state: Any, ctrl: Any, num_ctrl: Any) -> NativeState:
+    def __init__(self, simulations: Simulations, robot: Robot):
+        self._simulations, self._robot = simulations, robot
+        home = simulations.home_state()
+        self._home_bits = _to_bits(home)
+        self._home_joint_pos = simulations.describe(home[None])[1][0]
+        model = simulations.model.mj_model
+        # Where qpos and qvel lie among the numbers of a state.
+        self._qpos_ids, self._qvel_ids = simulations.coordinates(np.arange(simulations.state_size))
+        self._sizes = model.nq, model.nv
+
+    def init(self) -> NativeState:
+        poses = jnp.asarray(slot_model.parking_poses(), jnp.float32)
+        return self.reset(None, SceneParams(jnp.full(MAX_OBJECTS, -1, jnp.int32), poses, jnp.int32(0)))
+
+    def reset(self, state: NativeState | None, scene: SceneParams) -> NativeState:
+        del state
+        slots = self._qpos_ids[self._simulations.model.slot_qpos_ids]
+        return NativeState(
+            bits=self._write(jnp.asarray(self._home_bits), slots, scene.poses),
+            object_ids=scene.object_ids.astype(jnp.int32),
+            object_poses=scene.poses.astype(jnp.float32),
+            joint_pos=jnp.asarray(self._home_joint_pos),
+            diverged=jnp.zeros((), bool),
+        )
+
+    def place(self, object_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> NativeState:
+        bits = self._write(jnp.asarray(self._home_bits), self._qpos_ids, qpos)
+        model = self._simulations.model
+        return NativeState(
+            bits=self._write(bits, self._qvel_ids, qvel),
+            object_ids=object_ids.astype(jnp.int32),
+            object_poses=qpos[model.slot_qpos_ids].astype(jnp.float32),
+            joint_pos=qpos[self._robot.joint_qpos_ids(model.mj_model)].astype(jnp.float32),
+            diverged=jnp.zeros((), bool),
+        )
+
+    def run(self, state: NativeState, ctrl: jax.Array, num_ctrl: jax.Array) -> NativeState:
+        refuse_controls(ctrl, self._robot)
+        shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), state)
+        return jax.pure_callback(self.advance, shapes, state, ctrl, num_ctrl, vmap_method="broadcast_all")
+
+    def advance(self, state: NativeState, ctrl: Any, num_ctrl: Any) -> NativeState:
         batch = np.shape(num_ctrl)
         bits, object_ids, was_diverged = (
             np.asarray(x).reshape(-1, *np.shape(x)[len(batch) :])
@@ -233,45 +282,27 @@ def make_engine(bank: HullBank, *, threads: int = 0, model: SlotModel | None = N
         )
         ctrl = np.asarray(ctrl).reshape(-1, *np.shape(ctrl)[-2:])
         num_ctrl = np.where(was_diverged, 0, np.asarray(num_ctrl).reshape(-1))
-        new_state, diverged = simulations.run(_from_bits(bits), object_ids, ctrl, num_ctrl)
-        return package(new_state, object_ids, diverged | was_diverged, batch)
+        new_state, diverged = self._simulations.run(_from_bits(bits), object_ids, ctrl, num_ctrl)
+        leaves = (
+            _to_bits(new_state),
+            object_ids.astype(np.int32),
+            *self._simulations.describe(new_state),
+            diverged | was_diverged,
+        )
+        return NativeState(*(x.reshape((*batch, *x.shape[1:])) for x in leaves))  # pyright: ignore[reportArgumentType]
 
-    def host_coordinates(bits: Any) -> tuple[np.ndarray, np.ndarray]:
-        qpos, qvel = simulations.coordinates(_from_bits(np.asarray(bits)))
-        return qpos.astype(np.float32), qvel.astype(np.float32)
-
-    def host_place(object_ids: Any, qpos: Any, qvel: Any) -> NativeState:
-        object_ids, qpos, qvel = (np.asarray(x) for x in (object_ids, qpos, qvel))
-        state = simulations.initial_state(np.zeros((object_ids[..., 0].size, MAX_OBJECTS, 7)))
-        for part, values in zip(simulations.coordinates(state), (qpos, qvel), strict=True):
-            part[:] = values.reshape(part.shape)
-        return package(state, object_ids.reshape(-1, MAX_OBJECTS), np.zeros(len(state), bool), object_ids.shape[:-1])
-
-    callback = functools.partial(jax.pure_callback, vmap_method="broadcast_all")
-
-    def reset(state: NativeState, scene: SceneParams) -> NativeState:
-        del state
-        return callback(host_reset, shapes, scene.object_ids, scene.poses)
-
-    def init() -> NativeState:
-        poses = jnp.asarray(slot_model.parking_poses(), jnp.float32)
-        empty = SceneParams(jnp.full(MAX_OBJECTS, -1, jnp.int32), poses, jnp.int32(0))
-        return callback(host_reset, shapes, empty.object_ids, empty.poses)
-
-    def run(state: NativeState, ctrl: jax.Array, num_ctrl: jax.Array) -> NativeState:
-        if ctrl.shape[-1] != NUM_CONTROLS:
-            raise ValueError(f"ctrl must have {NUM_CONTROLS} columns, got {ctrl.shape[-1]}")
-        return callback(host_run, shapes, state, ctrl, num_ctrl)
-
-    def observe(state: NativeState) -> PhysicsObservation:
-        hand_pose = grasp_pose(state.joint_pos[:6])
+    def observe(self, state: NativeState) -> PhysicsObservation:
+        hand_pose = self._robot.hand_pose(state.joint_pos)
         return PhysicsObservation(state.object_poses, state.joint_pos, hand_pose, state.diverged, jnp.int32(0))
 
-    def coordinates(state: NativeState) -> tuple[jax.Array, jax.Array]:
-        sizes = (jax.ShapeDtypeStruct((size,), jnp.float32) for size in (mj_model.nq, mj_model.nv))
-        return callback(host_coordinates, tuple(sizes), state.bits)
+    def coordinates(self, state: NativeState) -> tuple[jax.Array, jax.Array]:
+        def read(bits: Any) -> tuple[np.ndarray, ...]:
+            found = self._simulations.coordinates(_from_bits(np.asarray(bits)))
+            return tuple(values.astype(np.float32) for values in found)
 
-    def place(object_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> NativeState:
-        return callback(host_place, shapes, object_ids, qpos, qvel)
+        shapes = tuple(jax.ShapeDtypeStruct((size,), jnp.float32) for size in self._sizes)
+        return jax.pure_callback(read, shapes, state.bits, vmap_method="broadcast_all")
 
-    return Engine("native", init, reset, run, observe, coordinates, place)
+    def _write(self, bits: jax.Array, ids: np.ndarray, values: jax.Array) -> jax.Array:
+        """Set numbers `ids` [...] of a state, given as bits, to values [...]."""
+        return bits.at[2 * ids[..., None] + np.arange(2)].set(widen_bits(values))

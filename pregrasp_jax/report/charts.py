@@ -4,10 +4,10 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
+from pregrasp_jax.evaluation.statistics import is_interval, is_number
 from pregrasp_jax.report.markup import Markup, element, join
 from pregrasp_jax.report.record import SECONDS, RunRecord
 from pregrasp_jax.report.svg import Point, Series, bar_chart, line_chart
-from pregrasp_jax.statistics import is_interval, is_number
 from pregrasp_jax.training.trainer import PHASES
 
 RECENT_EPISODES = 1000

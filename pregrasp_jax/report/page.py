@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from pregrasp_jax import io
+from pregrasp_jax.evaluation.statistics import is_number
 from pregrasp_jax.report import charts, results
 from pregrasp_jax.report.films import Film, film_strips
 from pregrasp_jax.report.markup import Markup, code, element, join
 from pregrasp_jax.report.record import SECONDS, RunRecord
-from pregrasp_jax.statistics import is_number
 
 REPORT = "report.html"
 """Name of the page in its run folder."""

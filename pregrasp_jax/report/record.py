@@ -8,8 +8,8 @@ from typing import Any
 
 import yaml
 
+from pregrasp_jax.evaluation.statistics import is_interval, is_number
 from pregrasp_jax.report.svg import Point
-from pregrasp_jax.statistics import is_interval, is_number
 
 SECONDS = "time/seconds"
 """Metric: training time, over all sessions, without start-up and compilation."""

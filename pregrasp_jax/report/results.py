@@ -7,10 +7,10 @@ from typing import Any
 
 from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.evaluation import load_evaluation
+from pregrasp_jax.evaluation.statistics import compare
 from pregrasp_jax.report.markup import Markup, element
 from pregrasp_jax.report.record import RunRecord
 from pregrasp_jax.report.svg import interval_mark
-from pregrasp_jax.statistics import compare
 
 BASELINES = ("random", "straight", "clear", "lookahead")
 """Scripts that a run is compared with."""

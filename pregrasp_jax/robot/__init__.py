@@ -1,4 +1,22 @@
-"""UR5e arm with an RG2 gripper: MJCF, kinematics, drawn links, clearance and the closing region.
+"""Robots, chosen by name."""
 
-Everything numeric about the robot is written once, in ``mjcf/``, and read from there.
-"""
+import functools
+from collections.abc import Callable
+
+from pregrasp_jax.robot import ur5e_rg2
+from pregrasp_jax.robot.base import Robot
+
+ROBOTS: dict[str, Callable[[], Robot]] = {"ur5e_rg2": ur5e_rg2.make_robot}
+"""Makers of robots by the name that `task.robot` knows them by; add your own before you make an environment."""
+
+
+@functools.cache
+def get_robot(name: str) -> Robot:
+    """Return the robot called `name`, made once.
+
+    Raises:
+        ValueError: there is none; the line lists those that exist.
+    """
+    if name not in ROBOTS:
+        raise ValueError(f"task.robot = {name!r} does not exist; allowed: {', '.join(sorted(ROBOTS))}")
+    return ROBOTS[name]()

@@ -1,14 +1,16 @@
-"""The MJCF files, found and read; what the rest of the package knows about the robot comes from here.
+"""The MJCF of the UR5e with the RG2, found and read; every number of this robot comes from there.
 
-Names in the compiled model: joints `ARM_JOINTS`, `FINGER_JOINTS` and two tips that mirror the fingers;
-actuators `ACTUATORS`; site ``grasp_point``; camera ``overhead``; plane ``table``.
+Names in the compiled model: joints `ARM_JOINTS`, `FINGER_JOINTS` and two tips that mirror the fingers; actuators
+`ACTUATORS`; site ``grasp_point``.
 """
 
 import functools
-from pathlib import Path
 
 import mujoco
 import numpy as np
+
+from pregrasp_jax import io
+from pregrasp_jax.robot.links import pose_to_matrix
 
 ARM_JOINTS = tuple(f"arm_{i}" for i in range(6))
 FINGER_JOINTS = ("hand_left_driver", "hand_right_driver")
@@ -22,34 +24,16 @@ BASE_BODY = "base"
 HAND_BODY = PALM_GEOM = "hand_palm"
 
 
-def mjcf_dir() -> Path:
-    """Return the folder of the MJCF files: inside an installed package, or beside it in a source checkout.
-
-    Raises:
-        FileNotFoundError: neither place holds scene.xml.
-    """
-    package = Path(__file__).resolve().parents[1]
-    places = (package / "mjcf", package.parent / "mjcf")
-    for place in places:
-        if (place / "scene.xml").is_file():
-            return place
-    raise FileNotFoundError(f"scene.xml is missing; looked in {places[0]} and {places[1]}")
-
-
-def load_spec() -> mujoco.MjSpec:
-    """Return robot, table and camera as a fresh spec, to which objects can be appended."""
-    return mujoco.MjSpec.from_file(str(mjcf_dir() / "scene.xml"))
-
-
-def load_table_spec() -> mujoco.MjSpec:
-    """Return the table alone, with the solver options of the full scene."""
-    return mujoco.MjSpec.from_file(str(mjcf_dir() / "table.xml"))
+def attach(spec: mujoco.MjSpec) -> None:
+    """Add the robot to a scene."""
+    robot = mujoco.MjSpec.from_file(str(io.mjcf_dir() / "ur5e.xml"))
+    spec.worldbody.add_frame().attach_body(robot.body(BASE_BODY), "", "")
 
 
 @functools.cache
 def robot_model() -> mujoco.MjModel:
-    """Return the compiled scene without objects; read it, do not change it."""
-    return load_spec().compile()
+    """Return the compiled robot without a scene; read it, do not change it."""
+    return mujoco.MjSpec.from_file(str(io.mjcf_dir() / "ur5e.xml")).compile()
 
 
 def joint_range(name: str) -> np.ndarray:
@@ -70,15 +54,6 @@ def dh_parameters() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return positions[:, 0], positions[:, 2], 2 * np.arctan2(quats[:, 1], quats[:, 0])
 
 
-def pose_to_matrix(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    """Return the 4 x 4 matrix of a position and a wxyz quaternion, in float64."""
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, np.asarray(quat, np.float64) / np.linalg.norm(quat))
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation.reshape(3, 3), pos
-    return matrix
-
-
 def world_from_base() -> np.ndarray:
     """Return T_world_base [4, 4]."""
     base = robot_model().body(BASE_BODY)
@@ -92,6 +67,14 @@ def flange_from_grasp_point() -> np.ndarray:
     return np.linalg.inv(wrist_from_flange) @ pose_to_matrix(site.pos, site.quat)
 
 
-def grasp_offset() -> float:
-    """Return the distance from the flange to the grasp point along the hand, m."""
-    return float(flange_from_grasp_point()[2, 3])
+def palm_to_grasp_point() -> float:
+    """Return the distance from the palm to the grasp point along the hand, m."""
+    palm = robot_model().geom(PALM_GEOM)
+    return float(flange_from_grasp_point()[2, 3] - palm.pos[0] - palm.size[0])
+
+
+def feed_forward() -> np.ndarray:
+    """Return kv / kp [7], s: the control q + (kv / kp) q_dot makes the actuators' damping act on the error only."""
+    mj_model = robot_model()
+    ids = [mj_model.actuator(name).id for name in ACTUATORS]
+    return np.abs(mj_model.actuator_biasprm[ids, 2]) / mj_model.actuator_gainprm[ids, 0]

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax.geometry import quat_to_matrix
+from pregrasp_jax.geometry import matrix_product, matrix_to_pose, quat_to_matrix
 from pregrasp_jax.robot import description
 
 _WRIST_SINGULAR = 1e-5
@@ -158,13 +158,6 @@ def unwrap_near(joints: jax.Array, reference: jax.Array) -> jax.Array:
     return jnp.where(allowed, near, joints)
 
 
-def nearest_solution(solutions: jax.Array, reference: jax.Array) -> jax.Array:
-    """Return the solution [6] of [8, 6] nearest to `reference` [6] (largest joint change), NaN if none exists."""
-    candidates = unwrap_near(solutions, reference)
-    change = jnp.max(jnp.abs(candidates - reference[None]), axis=-1)
-    return candidates[jnp.argmin(jnp.where(jnp.isnan(change), jnp.inf, change))]
-
-
 @functools.cache
 def _joint_limits() -> np.ndarray:
     return np.stack([description.joint_range(name) for name in description.ARM_JOINTS])
@@ -173,28 +166,3 @@ def _joint_limits() -> np.ndarray:
 def joint_limits() -> jax.Array:
     """Return the lower and upper limits [6, 2] of the arm joints, rad."""
     return jnp.asarray(_joint_limits(), jnp.float32)
-
-
-def matrix_to_pose(matrix: jax.Array) -> jax.Array:
-    """Return the pose [7] of a homogeneous matrix [4, 4], with qw >= 0.
-
-    Each row of the candidates is the quaternion times four times one of its components; the largest is stable.
-    """
-    (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = matrix[:3, :3]
-    candidates = jnp.stack(
-        [
-            jnp.stack([1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01]),
-            jnp.stack([m21 - m12, 1 + m00 - m11 - m22, m10 + m01, m02 + m20]),
-            jnp.stack([m02 - m20, m10 + m01, 1 - m00 + m11 - m22, m21 + m12]),
-            jnp.stack([m10 - m01, m02 + m20, m21 + m12, 1 - m00 - m11 + m22]),
-        ]
-    )
-    quat = candidates[jnp.argmax(jnp.diagonal(candidates))]
-    quat = quat / jnp.linalg.norm(quat)
-    return jnp.concatenate([matrix[:3, 3], jnp.where(quat[0] < 0, -quat, quat)])
-
-
-def matrix_product(a: jax.Array | np.ndarray, b: jax.Array | np.ndarray) -> jax.Array:
-    """Return a @ b for [..., 4, 4] in full float32; written as a sum, which XLA vectorizes over a batch."""
-    a, b = jnp.asarray(a, jnp.float32), jnp.asarray(b, jnp.float32)
-    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)

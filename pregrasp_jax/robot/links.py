@@ -1,9 +1,10 @@
-"""Where every part of the robot is, and its shape as convex hulls in link frames; both derived from the MJCF.
+"""Where every part of a robot is, and its shape as convex hulls in link frames; both derived from its MJCF.
 
-A link is a body of the MJCF: base, six arm links, the hand and, per side, the driver and the tip of a finger.
+A link is a body of the MJCF. `make_links` tabulates them once, when a robot is made.
 """
 
-import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -12,37 +13,14 @@ import mujoco
 import numpy as np
 
 from pregrasp_jax.assets.hulls import make_hulls
-from pregrasp_jax.robot import description
-from pregrasp_jax.robot.kinematics import matrix_product, matrix_to_pose
+from pregrasp_jax.geometry import matrix_product, matrix_to_pose
 from pregrasp_jax.types import FULL_TOPOLOGY, Hulls
 
 _CAPSULE_RINGS = ((9, 0.0), (6, np.deg2rad(40.0)), (1, np.deg2rad(90.0)))
 """Vertices and latitude of the rings on each half sphere, 32 in all; the best of a search over such layouts."""
 
 CAPSULE_ERROR = 0.0636
-"""Largest distance between a capsule and its polyhedron, as a share of the radius: 3.8 mm at the shoulder."""
-
-
-class Link(NamedTuple):
-    """One body of the robot.
-
-    Attributes:
-        name: as in the MJCF.
-        parent: index of the parent link, -1 for the world.
-        pos: [3] m in the parent.
-        quat: [4] wxyz in the parent.
-        axis: [3] joint axis, zero where the link is fixed.
-        joint: index into `description.JOINTS` of the joint that moves it.
-        ratio: joint angle per angle of that joint; -1 for a tip, which mirrors its driver.
-    """
-
-    name: str
-    parent: int
-    pos: np.ndarray
-    quat: np.ndarray
-    axis: np.ndarray
-    joint: int
-    ratio: float
+"""Largest distance between a capsule and its polyhedron, as a share of the radius: 3.8 mm at a UR5e's shoulder."""
 
 
 class LinkGeom(NamedTuple):
@@ -50,7 +28,7 @@ class LinkGeom(NamedTuple):
 
     Attributes:
         name: as in the MJCF.
-        link: index into `links()`.
+        link: index into `Links.names`.
         points: [2, 3] ends of a capsule or [8, 3] corners of a box, m in the link frame.
         radius: m.
     """
@@ -61,96 +39,141 @@ class LinkGeom(NamedTuple):
     radius: float
 
 
-@functools.cache
-def links() -> tuple[Link, ...]:
-    """Return the robot's links, parents first."""
-    mj_model = description.robot_model()
-    base = mj_model.body(description.BASE_BODY).id
-    bodies = [i for i in range(mj_model.nbody) if mj_model.body_rootid[i] == base]
-    moved_by = _moved_by(mj_model)
-    result = []
-    for body in bodies:
-        joint = mj_model.body_jntadr[body]
-        axis, (driver, ratio) = (
-            (mj_model.jnt_axis[joint].copy(), moved_by[joint]) if joint >= 0 else (np.zeros(3), (0, 0.0))
-        )
-        parent = mj_model.body_parentid[body]
-        result.append(
-            Link(
-                name=mj_model.body(body).name,
-                parent=bodies.index(parent) if parent in bodies else -1,
-                pos=mj_model.body_pos[body].copy(),
-                quat=mj_model.body_quat[body].copy(),
-                axis=axis,
-                joint=driver,
-                ratio=ratio,
-            )
-        )
-    return tuple(result)
+@dataclass(frozen=True, eq=False)
+class Links:
+    """The L bodies of a robot, parents first; everything is a host array.
+
+    Attributes:
+        names: as in the MJCF.
+        parents: [L] int, index of the parent link, -1 for the world.
+        fixed: [L, 4, 4] pose in the parent at joint position 0.
+        to_axis: [L, 4, 4] rotation of z onto the joint axis.
+        joint: [L] int, index into the joints of the joint that moves it; 0 where nothing does.
+        turn: [L] rad per unit of that joint; 0 where it does not turn, -1 where it mirrors another finger.
+        slide: [L] m per unit of that joint; 0 where it does not slide.
+        ancestors: [R, L] int, the ancestors 1, 2, 4, ... steps above; L is the world.
+        geoms: collision geoms in the order of the MJCF.
+        hulls: one per geom at `FULL_TOPOLOGY`, in link frames. Boxes are exact; a capsule's polyhedron straddles its
+            surface within `CAPSULE_ERROR` of its radius.
+        hull_links: [M] int32, the link of each hull.
+    """
+
+    names: tuple[str, ...]
+    parents: np.ndarray
+    fixed: np.ndarray
+    to_axis: np.ndarray
+    joint: np.ndarray
+    turn: np.ndarray
+    slide: np.ndarray
+    ancestors: np.ndarray
+    geoms: tuple[LinkGeom, ...]
+    hulls: Hulls
+    hull_links: np.ndarray
+
+    def matrices(self, joint_pos: jax.Array) -> jax.Array:
+        """Return the homogeneous world poses [L, 4, 4] for joint positions [J]; see `poses`.
+
+        All links at once, in log2(depth) rounds: each is multiplied onto its ancestor 1, 2, 4, ... steps above. The
+        rounds are a scan because XLA fuses an unrolled chain into one expression that takes minutes to compile.
+        """
+        angle = joint_pos[self.joint] * self.turn
+        cos, sin, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
+        rise = joint_pos[self.joint] * self.slide if self.slide.any() else zero
+        motion = [[cos, -sin, zero, zero], [sin, cos, zero, zero], [zero, zero, one, rise], [zero, zero, zero, one]]
+        about_z = jnp.stack([jnp.stack(row, axis=-1) for row in motion], axis=-2)
+        start = self.fixed @ self.to_axis
+        world = matrix_product(matrix_product(start, about_z), self.to_axis.swapaxes(1, 2))
+
+        def climb(world: jax.Array, ancestor: jax.Array) -> tuple[jax.Array, None]:
+            # The extra row is the world, the ancestor of whatever has run out of parents.
+            padded = jnp.concatenate([world, jnp.eye(4)[None]])
+            return matrix_product(padded[ancestor], world), None
+
+        return jax.lax.scan(climb, world, jnp.asarray(self.ancestors))[0]
+
+    def poses(self, joint_pos: jax.Array) -> jax.Array:
+        """Return the world poses [L, 7] for joint positions [J]. Agrees with MuJoCo's kinematics within 1e-6."""
+        return jax.vmap(matrix_to_pose)(self.matrices(joint_pos))
 
 
-def _moved_by(mj_model: mujoco.MjModel) -> dict[int, tuple[int, float]]:
-    """Return, per joint id, the index into `JOINTS` it follows and its ratio to it."""
-    ids = [mj_model.joint(name).id for name in description.JOINTS]
+def make_links(mj_model: mujoco.MjModel, joints: Sequence[str]) -> Links:
+    """Tabulate all bodies of a model that holds nothing but a robot.
+
+    Args:
+        mj_model: of the robot alone.
+        joints: names of the joints whose positions will be given; others must follow one of them by an equality.
+
+    Raises:
+        ValueError: a geom is neither capsule nor box, the two shapes that every engine collides; a body has several
+            joints, or one that nobody drives.
+    """
+    bodies = range(1, mj_model.nbody)
+    moved_by = _moved_by(mj_model, joints)
+    joint, turn, slide = (
+        np.zeros(len(bodies), int),
+        np.zeros(len(bodies), np.float32),
+        np.zeros(len(bodies), np.float32),
+    )
+    axes = np.zeros((len(bodies), 3))
+    for link, body in enumerate(bodies):
+        if mj_model.body_jntnum[body] > 1:
+            raise ValueError(f"body '{mj_model.body(body).name}' of the robot has several joints; allowed is one")
+        if mj_model.body_jntnum[body]:
+            own = int(mj_model.body_jntadr[body])
+            kind = mujoco.mjtJoint(int(mj_model.jnt_type[own]))
+            if own not in moved_by or kind not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+                raise ValueError(
+                    f"joint '{mj_model.joint(own).name}' of the robot; allowed are hinges and slides among "
+                    f"{', '.join(joints)}, or coupled to one of them"
+                )
+            axes[link], (joint[link], ratio) = mj_model.jnt_axis[own], moved_by[own]
+            (turn if kind == mujoco.mjtJoint.mjJNT_HINGE else slide)[link] = ratio
+    geoms = tuple(_link_geom(mj_model, geom) for geom in range(mj_model.ngeom))
+    parents = np.asarray(mj_model.body_parentid[1:]) - 1
+    return Links(
+        names=tuple(mj_model.body(body).name for body in bodies),
+        parents=parents,
+        fixed=np.stack([pose_to_matrix(mj_model.body_pos[b], mj_model.body_quat[b]) for b in bodies]),
+        to_axis=np.stack([_z_onto(axis) for axis in axes]),
+        joint=joint,
+        turn=turn,
+        slide=slide,
+        ancestors=_ancestors(parents),
+        geoms=geoms,
+        hulls=jax.tree.map(np.asarray, make_hulls([_hull_points(geom) for geom in geoms], FULL_TOPOLOGY)),
+        hull_links=np.array([geom.link for geom in geoms], np.int32),
+    )
+
+
+def pose_to_matrix(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """Return the 4 x 4 matrix of a position and a wxyz quaternion, in float64."""
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, np.asarray(quat, np.float64) / np.linalg.norm(quat))
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation.reshape(3, 3), pos
+    return matrix
+
+
+def _moved_by(mj_model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, tuple[int, float]]:
+    """Return, per joint id, the index into `joints` it follows and its ratio to it."""
+    ids = [mj_model.joint(name).id for name in joints]
     result = {joint: (index, 1.0) for index, joint in enumerate(ids)}
     for equality in range(mj_model.neq):
         follower, leader = mj_model.eq_obj1id[equality], mj_model.eq_obj2id[equality]
-        if follower not in result:
+        if follower not in result and leader in ids:
             result[follower] = (ids.index(leader), float(mj_model.eq_data[equality, 1]))
     return result
 
 
-def link_matrices(joint_pos: jax.Array) -> jax.Array:
-    """Return the homogeneous world poses [L, 4, 4] of the links for joint positions [8] rad; see `link_poses`.
-
-    All links at once, in log2(depth) rounds: each is multiplied onto its ancestor 1, 2, 4, ... steps above. The
-    rounds are a scan because XLA fuses an unrolled chain into one expression that takes minutes to compile.
-    """
-    fixed, to_axis, joint, ratio, ancestors = _chain()
-    angle = joint_pos[joint] * ratio
-    cos, sin, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
-    turn = [[cos, -sin, zero, zero], [sin, cos, zero, zero], [zero, zero, one, zero], [zero, zero, zero, one]]
-    about_z = jnp.stack([jnp.stack(row, axis=-1) for row in turn], axis=-2)
-    world = matrix_product(matrix_product(fixed @ to_axis, about_z), to_axis.swapaxes(1, 2))
-
-    def climb(world: jax.Array, ancestor: jax.Array) -> tuple[jax.Array, None]:
-        # The extra row is the world, the ancestor of whatever has run out of parents.
-        padded = jnp.concatenate([world, jnp.eye(4)[None]])
-        return matrix_product(padded[ancestor], world), None
-
-    return jax.lax.scan(climb, world, jnp.asarray(ancestors))[0]
-
-
-def link_poses(joint_pos: jax.Array) -> jax.Array:
-    """Return where the links are.
-
-    Args:
-        joint_pos: [8] rad, as in `PhysicsObservation`; tips mirror their drivers.
-
-    Returns:
-        [L, 7] world poses in the order of `links()`. Agrees with MuJoCo's kinematics within 1e-6 m and 1e-6.
-    """
-    return jax.vmap(matrix_to_pose)(link_matrices(joint_pos))
-
-
-@functools.cache
-def _chain() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the fixed numbers of `link_matrices`.
-
-    Returns:
-        T_parent_link [L, 4, 4], a rotation [L, 4, 4] of z onto the joint axis, joint [L] and ratio [L], and the
-        ancestors [R, L] 1, 2, 4, ... steps above (L is the world).
-    """
-    chain = links()
-    fixed = np.stack([description.pose_to_matrix(link.pos, link.quat) for link in chain])
-    to_axis = np.stack([_z_onto(link.axis) for link in chain])
-    parent = np.array([link.parent if link.parent >= 0 else len(chain) for link in chain] + [len(chain)])
+def _ancestors(parents: np.ndarray) -> np.ndarray:
+    """Return the ancestors [R, L] 1, 2, 4, ... steps above (L is the world)."""
+    world = len(parents)
+    parent = np.append(np.where(parents >= 0, parents, world), world)
     ancestors = []
-    while (parent[:-1] < len(chain)).any():
+    while (parent[:-1] < world).any():
         ancestors.append(parent[:-1])
         parent = parent[parent]
-    joint, ratio = np.array([link.joint for link in chain]), np.array([link.ratio for link in chain], np.float32)
-    return fixed, to_axis, joint, ratio, np.stack(ancestors)
+    return np.array(ancestors, int).reshape(-1, world)
 
 
 def _z_onto(axis: np.ndarray) -> np.ndarray:
@@ -158,28 +181,14 @@ def _z_onto(axis: np.ndarray) -> np.ndarray:
     quat = np.array([1.0, 0.0, 0.0, 0.0])
     if axis.any():
         mujoco.mju_quatZ2Vec(quat, axis)
-    return description.pose_to_matrix(np.zeros(3), quat)
+    return pose_to_matrix(np.zeros(3), quat)
 
 
-@functools.cache
-def link_geoms() -> tuple[LinkGeom, ...]:
-    """Return the robot's geoms in the order of the MJCF.
-
-    Raises:
-        ValueError: a geom is neither capsule nor box, the two shapes that every engine collides.
-    """
-    mj_model = description.robot_model()
-    index = {mj_model.body(link.name).id: i for i, link in enumerate(links())}
-    result = []
-    for geom in range(mj_model.ngeom):
-        body = int(mj_model.geom_bodyid[geom])
-        if body not in index:
-            continue
-        local, radius = _shape(mj_model, geom)
-        pose = description.pose_to_matrix(mj_model.geom_pos[geom], mj_model.geom_quat[geom])
-        points = local @ pose[:3, :3].T + pose[:3, 3]
-        result.append(LinkGeom(mj_model.geom(geom).name, index[body], points, radius))
-    return tuple(result)
+def _link_geom(mj_model: mujoco.MjModel, geom: int) -> LinkGeom:
+    local, radius = _shape(mj_model, geom)
+    pose = pose_to_matrix(mj_model.geom_pos[geom], mj_model.geom_quat[geom])
+    points = local @ pose[:3, :3].T + pose[:3, 3]
+    return LinkGeom(mj_model.geom(geom).name, int(mj_model.geom_bodyid[geom]) - 1, points, radius)
 
 
 def _shape(mj_model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
@@ -192,21 +201,8 @@ def _shape(mj_model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
     raise ValueError(f"geom '{mj_model.geom(geom).name}' of the robot must be a capsule or a box")
 
 
-@functools.cache
-def robot_hulls() -> tuple[Hulls, np.ndarray]:
-    """Return the robot as convex hulls.
-
-    Returns:
-        Hulls [M] at `FULL_TOPOLOGY` in link frames, and the link [M] int32 of each, in the order of `link_geoms()`.
-        Boxes are exact; a capsule's polyhedron straddles its surface within `CAPSULE_ERROR` of its radius.
-    """
-    geoms = link_geoms()
-    parts = [
-        geom.points if geom.radius == 0 else _capsule_points(geom.points[0], geom.points[1], geom.radius)
-        for geom in geoms
-    ]
-    hulls = jax.tree.map(jnp.asarray, make_hulls(parts, FULL_TOPOLOGY))
-    return hulls, np.array([geom.link for geom in geoms], np.int32)
+def _hull_points(geom: LinkGeom) -> np.ndarray:
+    return geom.points if geom.radius == 0 else _capsule_points(geom.points[0], geom.points[1], geom.radius)
 
 
 def _capsule_points(start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarray:

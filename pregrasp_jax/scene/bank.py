@@ -4,7 +4,6 @@ Try t of a split is drawn from its own seed, so that a bank does not depend on h
 once, and train, validation and test never share one.
 """
 
-import inspect
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,8 +15,6 @@ import numpy as np
 
 from pregrasp_jax import io
 from pregrasp_jax.config import SceneConfig
-from pregrasp_jax.robot.description import mjcf_dir
-from pregrasp_jax.scene import model as slot_model
 from pregrasp_jax.scene import packing
 from pregrasp_jax.types import MAX_OBJECTS, HullBank
 
@@ -25,6 +22,9 @@ Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 Progress = Callable[[int, int], None]
 """Called with scenes done and scenes wanted."""
+
+VERSION = 1
+"""Of how scenes are drawn and packed: raise it when the same settings would give other scenes."""
 
 _CHUNK = 16
 _FIELDS = ("object_ids", "poses", "yaw", "target", "seeds")
@@ -61,12 +61,10 @@ class SceneBank:
         return len(self.object_ids)
 
 
-def bank_hash(bank: HullBank, config: SceneConfig, split: Split) -> str:
-    """Return the hash of what shapes a scene bank: objects, settings, MuJoCo, and the code that packs."""
+def bank_hash(bank: HullBank, eligible: np.ndarray, config: SceneConfig, split: Split) -> str:
+    """Return the hash of what shapes a scene bank: objects, who may be a target, settings, MuJoCo, and `VERSION`."""
     sizes = (config.min_objects, config.max_objects, num_scenes(config, split), config.bank_seed, split)
-    sources = [inspect.getsource(part).encode() for part in (packing, slot_model, _draw)]
-    sources.append((mjcf_dir() / "table.xml").read_bytes())
-    return io.content_hash(bank.content_hash, list(sizes), mujoco.__version__, *sources)
+    return io.content_hash(bank.content_hash, eligible, list(sizes), mujoco.__version__, VERSION)
 
 
 def num_scenes(config: SceneConfig, split: Split) -> int:
@@ -75,15 +73,29 @@ def num_scenes(config: SceneConfig, split: Split) -> int:
 
 
 def load_or_build(
-    bank: HullBank, config: SceneConfig, split: Split, *, threads: int = 0, progress: Progress | None = None
+    bank: HullBank,
+    eligible: np.ndarray,
+    config: SceneConfig,
+    split: Split,
+    *,
+    threads: int = 0,
+    progress: Progress | None = None,
 ) -> SceneBank:
     """Return the split's scenes from the cache, or pack them and store them there; a damaged file is a warning.
+
+    Args:
+        bank: the objects.
+        eligible: [N] bool, which of them may be targets (see `Robot.eligibility`).
+        config: how many scenes, how crowded.
+        split: `train`, `validation` or `test`.
+        threads: 0 takes every core.
+        progress: told about scenes packed so far.
 
     Raises:
         ValueError: the object set cannot be packed (too few objects accepted or no eligible target), or there is
             no place to store the scenes.
     """
-    digest = bank_hash(bank, config, split)
+    digest = bank_hash(bank, eligible, config, split)
     path = io.cache_dir() / "scenes" / f"{split}-{digest}.npz"
     if path.is_file():
         try:
@@ -91,7 +103,7 @@ def load_or_build(
         except ValueError as error:
             warnings.warn(f"{' '.join(str(error).split())}; its scenes are packed anew", stacklevel=2)
     io.refuse_unwritable(path)
-    scenes = build(bank, config, split, threads=threads, progress=progress)
+    scenes = build(bank, eligible, config, split, threads=threads, progress=progress)
     save(path, scenes)
     return scenes
 
@@ -123,12 +135,18 @@ def load(path: Path, expected_hash: str | None = None) -> SceneBank:
 
 
 def build(
-    bank: HullBank, config: SceneConfig, split: Split, *, threads: int = 0, progress: Progress | None = None
+    bank: HullBank,
+    eligible: np.ndarray,
+    config: SceneConfig,
+    split: Split,
+    *,
+    threads: int = 0,
+    progress: Progress | None = None,
 ) -> SceneBank:
     """Pack scenes until the split is full; see `load_or_build`."""
     wanted = num_scenes(config, split)
-    if not np.asarray(bank.eligible).any():
-        raise ValueError("hull bank: no object is an eligible target; at least one must fit the closing region")
+    if not eligible.any():
+        raise ValueError("hull bank: no object is an eligible target; at least one must be")
     packer = packing.Packer(bank, _CHUNK, threads=threads)
     rows: list[tuple[np.ndarray, np.ndarray, float, int, int]] = []
     tries = 0
@@ -140,7 +158,7 @@ def build(
             )
         seeds = np.arange(tries, tries + _CHUNK)
         rngs = [np.random.default_rng([config.bank_seed, SPLITS.index(split), int(seed)]) for seed in seeds]
-        draws = [_draw(bank, config, rng) for rng in rngs]
+        draws = [_draw(eligible, config, rng) for rng in rngs]
         object_ids = np.stack([ids for ids, _, _ in draws])
         poses, accepted = packer.pack(object_ids, rngs)
         for i in np.flatnonzero(accepted):
@@ -158,13 +176,12 @@ def build(
         seeds=seeds,
         split=split,
         tries=int(seeds[-1]) + 1,
-        content_hash=bank_hash(bank, config, split),
+        content_hash=bank_hash(bank, eligible, config, split),
     )
 
 
-def _draw(bank: HullBank, config: SceneConfig, rng: np.random.Generator) -> tuple[np.ndarray, float, int]:
+def _draw(eligible: np.ndarray, config: SceneConfig, rng: np.random.Generator) -> tuple[np.ndarray, float, int]:
     """Draw objects (at least one of them eligible), a yaw, and an eligible target slot."""
-    eligible = np.asarray(bank.eligible)
     count = int(rng.integers(config.min_objects, config.max_objects + 1))
     while True:
         chosen = rng.choice(len(eligible), count, replace=count > len(eligible))

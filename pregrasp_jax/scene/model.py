@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from pregrasp_jax.scene.spec import compile_spec
 from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, HullBank
 
 GEOM_FIELDS = (
@@ -67,7 +68,7 @@ def make_slot_model(spec: mujoco.MjSpec, bank: HullBank) -> SlotModel:
     _add_slots(spec, bank)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE | mujoco.mjtDisableBit.mjDSBL_AUTORESET
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    mj_model = spec.compile()
+    mj_model = compile_spec(spec)
     surplus = [i for i in range(mj_model.ngeom) if mj_model.geom(i).name.startswith("catalogue")]
     mj_model.geom_contype[surplus] = 0
     mj_model.geom_conaffinity[surplus] = 0

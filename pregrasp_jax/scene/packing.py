@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene import model as slot_model
 from pregrasp_jax.scene.model import SlotModel
+from pregrasp_jax.scene.spec import table_spec
+from pregrasp_jax.spaces.workspace import TABLE
 from pregrasp_jax.types import HullBank
 
 SERVO_SPEED = 0.18
@@ -42,11 +43,6 @@ _PLACE_STEP = 0.005
 """m; start gap between two footprints, and step of the search for a free place."""
 
 
-def table_spec() -> mujoco.MjSpec:
-    """Return a table without a robot, with the contact options of the full scene."""
-    return robot.load_table_spec()
-
-
 def footprint_radius(bank: HullBank) -> np.ndarray:
     """Return the radius [N] m of each object's vertical projection about its frame's origin."""
     points = np.asarray(bank.full.vertices)[..., :2]
@@ -75,7 +71,7 @@ class Packer:
 
     def __init__(self, bank: HullBank, num_scenes: int, *, threads: int = 0):
         slot_model.silence_warnings()
-        self._model = slot_model.make_slot_model(table_spec(), bank)
+        self._model = slot_model.make_slot_model(table_spec(TABLE), bank)
         self._batch = Batch(self._model.mj_model, num_scenes, threads)
         names = (*slot_model.GEOM_FIELDS, *slot_model.BODY_FIELDS, slot_model.RBOUND)
         self._expanded = {name: self._batch.expand(name) for name in names}

@@ -5,22 +5,26 @@ physics of the next push may run while the learner still digests the last one.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import flax.struct as struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from pregrasp_jax import exploration
 from pregrasp_jax.config import ExplorationConfig
-from pregrasp_jax.judge import TARGET_IN_REGION
 from pregrasp_jax.learning.learner import Params, greedy_action
 from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.learning.replay import Steps
+from pregrasp_jax.physics.base import Engine
+from pregrasp_jax.policies import exploration
+from pregrasp_jax.task.primitive import Plan, Primitive
+from pregrasp_jax.task.rules import Rules
+from pregrasp_jax.task.stages import Stages, make_stages
 from pregrasp_jax.training.mishap import Mishap, no_mishap
 from pregrasp_jax.training.sharding import VmapFn
-from pregrasp_jax.types import REASONS, EnvState, HullBank, StepResult
+from pregrasp_jax.types import REASONS, EnvState, HandPose, StepResult
 
 RECENT_EPISODES = 200
 """Episodes behind `train/success_rate`, or one per scene where there are more scenes."""
@@ -30,20 +34,38 @@ class Environment(Protocol):
     """What training asks of `pregrasp_jax.env.Env`."""
 
     @property
-    def bank(self) -> HullBank:
-        """The objects."""
+    def engine(self) -> Engine:
+        """Physics."""
+        ...
+
+    @property
+    def primitive(self) -> Primitive:
+        """What an action means."""
+        ...
+
+    @property
+    def rules(self) -> Rules:
+        """How pushes are judged."""
         ...
 
     def reset(self, key: jax.Array) -> EnvState:
         """Return a random scene."""
         ...
 
-    def step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, StepResult]:
-        """Execute one push."""
+    def plan(self, state: EnvState, action: jax.Array) -> Plan:
+        """Return the motion of a push."""
         ...
 
-    def action_mask(self, p1: jax.Array) -> jax.Array:
-        """Return the cells [H, W] bool in which the next push may end."""
+    def conclude(self, state: EnvState, plan: Plan, physics: Any) -> tuple[EnvState, StepResult]:
+        """Look and judge after it."""
+        ...
+
+    def action_mask(self, hand: HandPose) -> jax.Array:
+        """Return which actions [H, W, K] bool are allowed next."""
+        ...
+
+    def eligible_slots(self, object_ids: jax.Array) -> jax.Array:
+        """Return which slots [...] bool may be targets."""
         ...
 
 
@@ -118,10 +140,6 @@ class Experience(struct.PyTreeNode):
     episodes: jax.Array
 
 
-CollectFn = Callable[[Actors, Params], tuple[Actors, Experience]]
-"""``(actors, params) -> (actors, experience)``."""
-
-
 def init_actors(key: jax.Array, env: Environment, num_envs: int, *, vmap: VmapFn = jax.vmap) -> Actors:
     """Return `num_envs` scenes at the start of an episode; `vmap` is as in `make_collect`."""
     key, reset_key = jax.random.split(key)
@@ -147,8 +165,8 @@ def make_collect(
     *,
     warmup: int,
     vmap: VmapFn = jax.vmap,
-) -> CollectFn:
-    """Return the function that pushes once in every scene and resets those that ended.
+) -> Stages:
+    """Return the function ``(actors, params) -> (actors, experience)``: push in every scene, reset those that ended.
 
     Args:
         env: the scenes.
@@ -159,21 +177,23 @@ def make_collect(
     """
 
     def explore(key: jax.Array, state: EnvState, mask: jax.Array) -> jax.Array:
+        actions = q_function.actions
         if not config.guided:
-            return exploration.random_action(key, q_function.domain_fn(state.p1))
-        target_xy = state.centroids[state.scene.target]
+            valued = jnp.broadcast_to(q_function.domain_fn(state.hand)[..., None], actions.shape)
+            return exploration.random_action(key, valued, actions)
         return exploration.guided_action(
             key,
-            state.p1,
-            target_xy,
+            state.hand,
+            state.target_xy,
             mask,
+            actions,
             angle_std=config.angle_std,
             open_probability=config.open_probability,
         )
 
     def act(key: jax.Array, state: EnvState, q: jax.Array, epsilon: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return actions [1 + branches] of one scene, the real one first, and which of them are random."""
-        mask = env.action_mask(state.p1)
+        mask = env.action_mask(state.hand)
         explore_key, choice_key, softmax_key = jax.random.split(key, 3)
         explore_keys = jax.random.split(explore_key, 1 + config.branches)
         exploratory = jax.vmap(explore, (0, None, None))(explore_keys, state, mask)
@@ -183,34 +203,46 @@ def make_collect(
         promising = jnp.concatenate([greedy_action(q, mask)[None], drawn])
         return jnp.where(random, exploratory, promising), random
 
-    def collect(actors: Actors, params: Params) -> tuple[Actors, Experience]:
+    def decide(actors: Actors, params: Params) -> tuple[Any, Plan, Any]:
         states = actors.env_states
-        num_envs = states.p1.shape[0]
+        num_envs = states.num_pushes.shape[0]
         key, action_key, reset_key = jax.random.split(actors.key, 3)
         epsilon = epsilon_at(actors.tally.env_steps, config, warmup=warmup)
         q = q_function.apply(params, jax.vmap(q_function.input_fn)(states.obs, states.scene.target))
         keys = jax.random.split(action_key, num_envs)
         actions, random = jax.vmap(act, (0, 0, 0, None))(keys, states, q, epsilon)
         # Scenes first, then the branches: [E (1 + branches)].
-        starts = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * (1 + config.branches)), states)
-        actions = actions.T.ravel()
-        ends, results = vmap(env.step)(starts, actions)
+        starts, actions = _with_branches(states, config), actions.T.ravel()
+        plans = vmap(env.plan)(starts, actions)
+        return starts.physics, plans, (actors.replace(key=key), actions, random[:, 0], reset_key)
+
+    def conclude(kept: Any, plans: Plan, physics: Any) -> tuple[Actors, Experience]:
+        actors, actions, random, reset_key = kept
+        states = actors.env_states
+        num_envs = states.num_pushes.shape[0]
+        starts = _with_branches(states, config)
+        ends, results = vmap(env.conclude)(starts, plans, physics)
         of_branch = jnp.arange(len(actions)) >= num_envs
         results = results.replace(truncated=results.truncated | (of_branch & ~results.terminated))
         root = jnp.arange(len(actions), dtype=jnp.int32) % num_envs
         steps = _steps(root, starts, actions, results, ends)
-        experience = Experience(steps, _eligible(env.bank, starts), jnp.int32(0))
+        experience = Experience(steps, env.eligible_slots(starts.scene.object_ids), jnp.int32(0))
         next_states, results = jax.tree.map(lambda leaf: leaf[:num_envs], (ends, results))
         ended = results.terminated | results.truncated
         overflowed = ends.physics_obs.overflows > starts.physics_obs.overflows
         diverged = steps.outcome.diverged
-        tally = _count(actors.tally, results, ended, random[:, 0], overflowed, diverged)
+        tally = _count(actors.tally, results, ended, random, overflowed, diverged)
         mishap = actors.mishap.note(states, actions, ends, diverged, tally.env_steps)
         fresh = vmap(env.reset)(jax.random.split(reset_key, num_envs))
-        actors = Actors(_select(ended, fresh, next_states), key, tally, mishap)
+        actors = Actors(_select(ended, fresh, next_states), actors.key, tally, mishap)
         return actors, experience.replace(episodes=tally.episodes)
 
-    return collect
+    return make_stages(env.engine, decide, conclude, vmap=vmap)
+
+
+def _with_branches(states: EnvState, config: ExplorationConfig) -> EnvState:
+    """Return E scenes and their branches, [E (1 + branches)]."""
+    return jax.tree.map(lambda leaf: jnp.concatenate([leaf] * (1 + config.branches)), states)
 
 
 def epsilon_at(env_steps: jax.Array | int, config: ExplorationConfig, *, warmup: int) -> jax.Array:
@@ -230,14 +262,10 @@ def _steps(root: jax.Array, states: EnvState, actions: jax.Array, results: StepR
         outcome=results.outcome,
         reward=results.reward,
         terminated=results.terminated,
+        reason=results.reason,
         truncated=results.truncated,
         next_obs=next_states.obs,
     )
-
-
-def _eligible(bank: HullBank, states: EnvState) -> jax.Array:
-    object_ids = states.scene.object_ids
-    return jnp.asarray(bank.eligible)[object_ids] & (object_ids >= 0)
 
 
 def _select(ended: jax.Array, fresh: Any, going_on: Any) -> Any:
@@ -269,15 +297,20 @@ def _count(
     )
 
 
-def report(tally: Tally) -> dict[str, Any]:
-    """Return the row of metrics () of a tally, on the host; shares without a case are None."""
+def report(tally: Tally, successes: Sequence[int]) -> dict[str, Any]:
+    """Return the row of metrics () of a tally, on the host; shares without a case are None.
+
+    Args:
+        tally: the counts.
+        successes: reasons that count as success.
+    """
     counts = jax.device_get(tally)
     recent = counts.recent[counts.recent >= 0]
     episodes = int(counts.reasons.sum())
     return {
         "env_steps": int(counts.env_steps),
         "episodes": int(counts.episodes),
-        "train/success_rate": float((recent == TARGET_IN_REGION).mean()) if len(recent) else None,
+        "train/success_rate": float(np.isin(recent, successes).mean()) if len(recent) else None,
         "train/reward": float(counts.reward / counts.pushes) if counts.pushes else None,
         "train/episode_length": float(counts.pushes / episodes) if episodes else None,
         "train/explored": float(counts.explored / counts.pushes) if counts.pushes else None,

@@ -2,8 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import Any, TextIO
 
 from rich.console import Console as RichConsole
@@ -80,15 +79,6 @@ class Console:
     def close(self) -> None:
         """Remove the bar and give the cursor back."""
         self._progress.stop()
-
-
-@contextmanager
-def announced_compilation(say: Callable[[str], None]) -> Iterator[None]:
-    """Say that a block compiles, and afterwards how long it took, so that nothing hangs in silence."""
-    say("compiling ...")
-    start = time.perf_counter()
-    yield
-    say(f"compiled in {time.perf_counter() - start:.1f} s")
 
 
 def describe(row: dict[str, Any], eta: float | None) -> str:

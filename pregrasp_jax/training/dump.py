@@ -23,12 +23,12 @@ import numpy as np
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint import trees
 from pregrasp_jax.config import Config, from_dict, to_dict
-from pregrasp_jax.env import Env
 from pregrasp_jax.machine import versions
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.training.mishap import Mishap, no_mishap
 from pregrasp_jax.types import MAX_OBJECTS, SceneParams
 
-FORMAT = "pregrasp_jax dump 1"
+FORMAT = "pregrasp_jax dump 2"
 
 MAX_DUMPS = 20
 """Files per run: a setting with which every push diverges shall not fill the disk."""

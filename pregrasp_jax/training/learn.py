@@ -12,11 +12,13 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from pregrasp_jax.config import LearnerConfig, ReplayConfig, TaskConfig
+from pregrasp_jax.config import LearnerConfig, ReplayConfig
 from pregrasp_jax.learning import hindsight, learner
 from pregrasp_jax.learning import replay as replay_lib
-from pregrasp_jax.learning.learner import ApplyFn, AugmentFn, LearnerState, MaskFn, Params, QAtFn
-from pregrasp_jax.learning.replay import Batch, InputFn, Replay, Steps
+from pregrasp_jax.learning.learner import LearnerState
+from pregrasp_jax.learning.q_function import Params
+from pregrasp_jax.learning.replay import Replay, Steps
+from pregrasp_jax.task.rules import Rules
 from pregrasp_jax.training.collect import Experience
 
 
@@ -82,64 +84,25 @@ def init_learning(
     )
 
 
-def make_remember(config: ReplayConfig, task: TaskConfig) -> RememberFn:
+def make_remember(config: ReplayConfig, rules: Rules) -> RememberFn:
     """Return the function that adds one push of every scene to the memory, and hindsight rows where they are due."""
 
     def remember(state: Learning, experience: Experience) -> Learning:
         replay = replay_lib.add(state.replay, experience.steps)
         if config.hindsight:
-            rule = task.obstacles_may_leave
-            replay = hindsight.add_hindsight(replay, experience.eligible, obstacles_may_leave=rule)
+            replay = hindsight.add_hindsight(replay, experience.eligible, rules)
         return state.replace(replay=replay)
 
     return remember
 
 
-def make_update(
-    *,
-    apply_fn: ApplyFn,
-    q_at_fn: QAtFn,
-    mask_fn: MaskFn,
-    input_fn: InputFn,
-    augment_fn: AugmentFn,
-    optimizer: optax.GradientTransformation,
-    config: LearnerConfig,
-    replay_config: ReplayConfig,
-    split_fn: Callable[[Batch], Batch],
-) -> UpdateFn:
-    """Return the function that updates once.
-
-    Args:
-        apply_fn: the network on the whole grid.
-        q_at_fn: the network at the taken actions.
-        mask_fn: the half ring.
-        input_fn: fuses an observation for a goal.
-        augment_fn: see `learner.learn`.
-        optimizer: see `make_optimizer`.
-        config: discount, loss, batch.
-        replay_config: prioritization.
-        split_fn: see `learner.learn`.
-    """
+def make_update(**options: Any) -> UpdateFn:
+    """Return the function that updates once; `options` are the keyword arguments of `learner.learn` but beta."""
 
     def update(state: Learning, beta: jax.Array) -> Learning:
         key, sample_key = jax.random.split(state.key)
         learner_state, replay, metrics = learner.learn(
-            state.learner,
-            state.replay,
-            sample_key,
-            batch_size=config.batch_size,
-            input_fn=input_fn,
-            augment_fn=augment_fn,
-            split_fn=split_fn,
-            importance_exponent=beta,
-            priority_exponent=replay_config.priority_exponent,
-            apply_fn=apply_fn,
-            mask_fn=mask_fn,
-            optimizer=optimizer,
-            q_at_fn=q_at_fn,
-            discount=config.discount,
-            polyak=config.polyak,
-            huber_delta=config.huber_delta,
+            state.learner, state.replay, sample_key, importance_exponent=beta, **options
         )
         metrics = _accumulate(state.metrics, metrics, state.updates)
         return Learning(learner_state, replay, key, state.updates + 1, metrics)

@@ -10,7 +10,7 @@ import flax.struct as struct
 import jax
 import jax.numpy as jnp
 
-from pregrasp_jax.types import EnvState, PhysicsObservation
+from pregrasp_jax.types import EnvState, HandPose, PhysicsObservation
 
 NONE = -1
 """The action of a mishap that did not happen."""
@@ -21,6 +21,7 @@ class Mishap(struct.PyTreeNode):
 
     Attributes:
         state: before it, without what the camera saw (20 kB that follow from the rest).
+        hand: where the hand had been sent before it.
         action: () int32 flat index of the push, `NONE` if nothing has happened.
         seen: what the engine reported afterwards.
         scene: () int32 which of the E scenes.
@@ -29,6 +30,7 @@ class Mishap(struct.PyTreeNode):
     """
 
     state: EnvState
+    hand: HandPose
     action: jax.Array
     seen: PhysicsObservation
     scene: jax.Array
@@ -47,11 +49,12 @@ class Mishap(struct.PyTreeNode):
             diverged: [E B] bool.
             env_steps: () int32 pushes so far, these included.
         """
-        num_envs = states.p1.shape[0]
+        num_envs = states.num_pushes.shape[0]
         first = jnp.argmax(diverged)
         scene, branch = first % num_envs, first // num_envs
         new = Mishap(
             state=_row(states.replace(obs=None), scene),
+            hand=_row(states.hand, scene),
             action=actions[first],
             seen=_row(ends.physics_obs, first),
             scene=scene.astype(jnp.int32),
@@ -68,9 +71,10 @@ class Mishap(struct.PyTreeNode):
 
 def no_mishap(states: EnvState) -> Mishap:
     """Return one that did not happen, in the shapes of E `states`."""
-    state, seen = jax.tree.map(jnp.zeros_like, _row((states.replace(obs=None), states.physics_obs), 0))
+    rows = _row((states.replace(obs=None), states.hand, states.physics_obs), 0)
+    state, hand, seen = jax.tree.map(jnp.zeros_like, rows)
     action, scene, branch, env_steps = jnp.full(4, NONE)
-    return Mishap(state, action, seen, scene, branch, env_steps)
+    return Mishap(state, hand, action, seen, scene, branch, env_steps)
 
 
 def _row(tree: Any, index: jax.Array | int) -> Any:

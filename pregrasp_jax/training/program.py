@@ -1,23 +1,20 @@
 """The compiled parts of a training and the state that they share."""
 
 import dataclasses
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import flax.struct as struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax import io
 from pregrasp_jax.checkpoint.chunks import Ring
 from pregrasp_jax.config import Config
-from pregrasp_jax.learning.learner import Params
-from pregrasp_jax.learning.q_function import QFunction, make_q_function
-from pregrasp_jax.training.collect import Actors, CollectFn, Environment, Experience, init_actors, make_collect
+from pregrasp_jax.learning.q_function import Params, QFunction, make_q_function
+from pregrasp_jax.task.stages import Stages
+from pregrasp_jax.training.collect import Actors, Environment, Experience, init_actors, make_collect
 from pregrasp_jax.training.learn import (
     Learning,
     RememberFn,
@@ -28,9 +25,6 @@ from pregrasp_jax.training.learn import (
     make_update,
 )
 from pregrasp_jax.training.sharding import Layout
-
-CACHE_SWITCH = "PREGRASP_JAX_COMPILATION_CACHE"
-"""Environment variable: 0 turns the compilation cache off, wherever it is."""
 
 
 class TrainState(struct.PyTreeNode):
@@ -78,15 +72,17 @@ class Program:
         collect: pushes once in every scene; donates the actors.
         remember: adds a push of every scene to the memory; donates the learning state.
         update: samples and updates once; donates the learning state.
+        successes: reasons that count as success.
         fused_iterations: how many iterations `compile` puts into one program, see `make_iterate`; 0 compiles the parts.
         iterate: that program.
         layout: which device holds what of all this.
     """
 
     init: Callable[[jax.Array], TrainState]
-    collect: CollectFn
+    collect: Callable[..., Any]
     remember: RememberFn
     update: UpdateFn
+    successes: tuple[int, ...]
     fused_iterations: int = 0
     iterate: IterateFn | None = None
     layout: Layout = field(default_factory=Layout)
@@ -122,8 +118,12 @@ class Program:
             return dataclasses.replace(self, iterate=iterate)
         arguments = (state.actors, state.learning.learner.params)
         experience = jax.eval_shape(self.collect, *arguments)[1]
+
+        def compile_collect(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+            return _compile(function, arguments, (of_state.actors, copied), (of_state.actors, copied))
+
         parts = {
-            "collect": _compile(self.collect, arguments, (of_state.actors, copied), (of_state.actors, copied)),
+            "collect": cast(Stages, self.collect).compile(*arguments, compile_fn=compile_collect),
             "remember": _compile(self.remember, (state.learning, experience), (copied, copied), copied),
             "update": _compile(self.update, (state.learning, np.float32(0)), (copied, copied), copied),
         }
@@ -150,10 +150,13 @@ def make_program(
     Raises:
         ValueError: `params` do not fit the network.
     """
-    q = q_function or make_q_function(config.network, config.task)
+    q = q_function or make_q_function(config.network, config.task, env.primitive.actions)
     optimizer = make_optimizer(config.learner)
+    stages = make_collect(env, q, config.exploration, warmup=config.learner.warmup, vmap=layout.vmap)
     # Under jit, so that shapes, start and compilation share one trace: that of a physics engine takes seconds.
-    collect = jax.jit(make_collect(env, q, config.exploration, warmup=config.learner.warmup, vmap=layout.vmap))
+    collect = dataclasses.replace(
+        stages, before=jax.jit(stages.before), run=jax.jit(stages.run), after=jax.jit(stages.after)
+    )
 
     def init(key: jax.Array) -> TrainState:
         network_key, actor_key, learner_key = jax.random.split(key, 3)
@@ -173,11 +176,9 @@ def make_program(
         return TrainState(actors, learning)
 
     update = make_update(
-        apply_fn=q.apply,
-        q_at_fn=q.of_action,
+        q=q,
         mask_fn=env.action_mask,
-        input_fn=q.input_fn,
-        augment_fn=q.augment,
+        successes=env.rules.successes,
         optimizer=optimizer,
         config=config.learner,
         replay_config=config.replay,
@@ -188,8 +189,8 @@ def make_program(
             f"the initial parameters (--init-from) are of another network; allowed is network.architecture = "
             f"{config.network.architecture} and network.width = {config.network.width}"
         )
-    remember = make_remember(config.replay, config.task)
-    return Program(init, collect, remember, update, _num_fused(config), layout=layout)
+    remember = make_remember(config.replay, env.rules)
+    return Program(init, collect, remember, update, env.rules.successes, _num_fused(config), layout=layout)
 
 
 def _num_fused(config: Config) -> int:
@@ -229,20 +230,3 @@ def _compile(function: Callable[..., Any], arguments: tuple[Any, ...], shardings
     """Return a function compiled for its arguments and for where they and the result lie; it donates the first."""
     jitted = jax.jit(function, donate_argnums=0, in_shardings=shardings, out_shardings=result)
     return jitted.lower(*arguments).compile()
-
-
-def compilation_cache_dir() -> Path | None:
-    """Return where compiled programs are kept: the user's own choice for jax, or the cache folder; None if nowhere."""
-    if os.environ.get(CACHE_SWITCH) == "0":
-        return None
-    return Path(jax.config.values["jax_compilation_cache_dir"] or io.cache_dir() / "jax")
-
-
-def enable_compilation_cache() -> None:
-    """Keep compiled programs in `compilation_cache_dir`."""
-    folder = compilation_cache_dir()
-    if folder is None:
-        jax.config.update("jax_enable_compilation_cache", False)
-    elif not jax.config.values["jax_compilation_cache_dir"]:
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)

@@ -6,19 +6,20 @@ from typing import Any
 
 import jax
 
-from pregrasp_jax import io, policies
+from pregrasp_jax import io
 from pregrasp_jax.checkpoint.policy import load_policy
 from pregrasp_jax.config import Config, to_dict
-from pregrasp_jax.env import Env, make_env
 from pregrasp_jax.evaluation import Evaluator
-from pregrasp_jax.learning.learner import Params
-from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.learning.q_function import Params, make_q_function
+from pregrasp_jax.machine import enable_compilation_cache
+from pregrasp_jax.policies.learned import make_learned
+from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.training import processes, resources
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.dump import make_dump
 from pregrasp_jax.training.event_log import require_module
 from pregrasp_jax.training.interrupt import Interrupt
-from pregrasp_jax.training.program import enable_compilation_cache, make_program
+from pregrasp_jax.training.program import make_program
 from pregrasp_jax.training.run_folder import RunFolder, WatchedFolder, refuse_used
 from pregrasp_jax.training.sharding import make_layout
 from pregrasp_jax.training.trainer import CompileFn, EvaluateFn, Trainer
@@ -94,7 +95,7 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
 
 def make_evaluate(env: Env, config: Config) -> tuple[EvaluateFn, CompileFn]:
     """Return the function that measures parameters on all scenes of `env`, grasp included, and what compiles it."""
-    make_policy = policies.make_learned(env, make_q_function(config.network, config.task).values)
+    make_policy = make_learned(env, make_q_function(config.network, config.task, env.primitive.actions).values)
     episodes = len(env.scenes)
     evaluator = Evaluator(env, num_envs=min(VALIDATION_ENVS, episodes))
 

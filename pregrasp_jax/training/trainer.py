@@ -11,13 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax import exploration
 from pregrasp_jax.checkpoint import Restored, restore, save, save_policy
 from pregrasp_jax.config import Config
 from pregrasp_jax.learning.learner import Params
 from pregrasp_jax.learning.replay import forget
+from pregrasp_jax.machine import announced_compilation
+from pregrasp_jax.policies import exploration
 from pregrasp_jax.training import collect, learn, processes
-from pregrasp_jax.training.console import Console, announced_compilation, format_time
+from pregrasp_jax.training.console import Console, format_time
 from pregrasp_jax.training.dump import DumpFn
 from pregrasp_jax.training.mishap import NONE
 from pregrasp_jax.training.program import IterateFn, Program, TrainState
@@ -239,7 +240,7 @@ class Trainer:
             FloatingPointError: the loss is no longer finite; all checkpoints are.
         """
         progress, actors, learning = self.progress, self.state.actors, self.state.learning
-        row = collect.report(actors.tally) | learn.report(learning)
+        row = collect.report(actors.tally, self.program.successes) | learn.report(learning)
         epsilon = collect.epsilon_at(progress.env_steps, self.config.exploration, warmup=self.config.learner.warmup)
         steps, seconds = progress.env_steps - self._logged_at[0], progress.total_seconds - self._logged_at[1]
         row |= {"train/epsilon": float(epsilon), "time/seconds": progress.total_seconds}

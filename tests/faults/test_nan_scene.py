@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from fake_training import PictureEnv, make_config, make_trainer, rows
 
-from pregrasp_jax.judge import judge
+from pregrasp_jax.task.rules import judge
 from pregrasp_jax.training import dump
 from pregrasp_jax.training.collect import Actors
 from pregrasp_jax.training.dump import load_dump

@@ -1,24 +1,19 @@
-"""Policies: who decides the next push.
+"""Policies that need no training. They read the true object poses.
 
-A policy maps one scene and a key to an action; `jax.vmap` it over scenes. It is either a plain function or a
-`jax.tree_util.Partial`, whose bound arrays (network parameters) are leaves, so that an evaluation compiled
-once serves every checkpoint of a run. Scripts read the true object poses; only `make_learned` is restricted
-to what the camera sees.
+A policy maps one scene and a key to an action; `jax.vmap` it over scenes.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import flax.struct as struct
 import jax
 import jax.numpy as jnp
-from jax.tree_util import Partial
 
-from pregrasp_jax import grid
-from pregrasp_jax.env import Env
-from pregrasp_jax.exploration import guided_action, random_action
-from pregrasp_jax.judge import TARGET_IN_REGION
-from pregrasp_jax.types import CLOSED, OPEN, EnvState, Observation
+from pregrasp_jax.policies.exploration import guided_action, random_action
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.spaces.actions import ActionSpace
+from pregrasp_jax.task.env import Env
+from pregrasp_jax.types import EnvState
 
 Policy = Callable[[EnvState, jax.Array], jax.Array]
 """(state, key) -> action () int32, unbatched."""
@@ -40,10 +35,10 @@ _GUIDED = {"angle_std": 0.5, "open_probability": 0.7}
 
 
 def make_random(env: Env) -> Policy:
-    """Return the policy that draws a cell of the half ring and an aperture uniformly."""
+    """Return the policy that draws a choice uniformly, and a cell that is allowed with it."""
 
     def act(state: EnvState, key: jax.Array) -> jax.Array:
-        return random_action(key, env.action_mask(state.p1))
+        return random_action(key, env.action_mask(state.hand), env.primitive.actions)
 
     return act
 
@@ -52,31 +47,32 @@ def make_guided(env: Env) -> Policy:
     """Return the policy of pure guided exploration (Sec. III-E)."""
 
     def act(state: EnvState, key: jax.Array) -> jax.Array:
-        return guided_action(key, state.p1, target_xy(state), env.action_mask(state.p1), **_GUIDED)
+        mask = env.action_mask(state.hand)
+        return guided_action(key, state.hand, state.target_xy, mask, env.primitive.actions, **_GUIDED)
 
     return act
 
 
 def make_straight(env: Env) -> Policy:
-    """Return the policy that moves the open hand straight at the target, as far as the half ring allows."""
+    """Return the policy that moves the open hand straight at the target, as far as is allowed."""
+    actions = env.primitive.actions
 
     def act(state: EnvState, key: jax.Array) -> jax.Array:
         del key
-        row, col = nearest_cell(env.action_mask(state.p1), target_xy(state))
-        return grid.encode_action(row, col, jnp.int32(OPEN))
+        return nearest_action(env.action_mask(state.hand), state.target_xy, jnp.int32(actions.widest), actions)
 
     return act
 
 
 def make_clear(env: Env) -> Policy:
     """Return `straight` with the hand closed, to clear the way, until the target is within `CLEAR_DISTANCE`."""
+    actions = env.primitive.actions
 
     def act(state: EnvState, key: jax.Array) -> jax.Array:
         del key
-        target = target_xy(state)
-        row, col = nearest_cell(env.action_mask(state.p1), target)
-        near = jnp.linalg.norm(target - state.p1) <= CLEAR_DISTANCE
-        return grid.encode_action(row, col, jnp.where(near, OPEN, CLOSED))
+        near = jnp.linalg.norm(state.target_xy - state.hand.xy) <= CLEAR_DISTANCE
+        choice = jnp.where(near, actions.widest, actions.narrowest)
+        return nearest_action(env.action_mask(state.hand), state.target_xy, choice, actions)
 
     return act
 
@@ -165,7 +161,7 @@ def _advance(env: Env, plans: _Plans, actions: jax.Array) -> _Plans:
     states, results = jax.vmap(lambda state, action, go: env.step(state, action, execute=go))(
         plans.states, actions, execute
     )
-    held = _first_grasp(env, states, execute & (results.reason == TARGET_IN_REGION))
+    held = _first_grasp(env, states, execute & env.rules.succeeded(results.reason))
     distance = jax.vmap(lambda outcome, target: outcome.distance_after[target])(results.outcome, states.scene.target)
     failed = jnp.where(plans.depth == 0, _FAILURE, plans.values)
     values = jnp.where(held, _SUCCESS, jnp.where(results.terminated, failed, -distance))
@@ -194,27 +190,6 @@ def _first_grasp(env: Env, states: EnvState, enclosed: jax.Array) -> jax.Array:
     return jax.lax.while_loop(untried, grasp, (enclosed, jnp.zeros_like(enclosed)))[1]
 
 
-def make_learned(
-    env: Env,
-    q_values: Callable[[Any, Observation, jax.Array], jax.Array],
-) -> Callable[[Any], Policy]:
-    """Return the constructor params -> policy of greedy pushes inside the half ring.
-
-    Every policy made by one constructor shares its compiled evaluation.
-
-    Args:
-        env: says which cells are allowed.
-        q_values: (params, observation, target slot) -> Q [H, W, 2].
-    """
-
-    def act(params: Any, state: EnvState, key: jax.Array) -> jax.Array:
-        del key
-        q = q_values(params, state.obs, state.scene.target)
-        return jnp.argmax(jnp.where(env.action_mask(state.p1)[..., None], q, -jnp.inf)).astype(jnp.int32)
-
-    return lambda params: Partial(act, params)
-
-
 SCRIPTS: dict[str, Callable[[Env], Policy]] = {
     "random": make_random,
     "guided": make_guided,
@@ -225,14 +200,16 @@ SCRIPTS: dict[str, Callable[[Env], Policy]] = {
 """Policies that need no training, by the name `evaluate.py --policy` knows them by."""
 
 
-def target_xy(state: EnvState) -> jax.Array:
-    """Return the planar centroid [2] of the target, m."""
-    return state.centroids[state.scene.target]
+def nearest_action(mask: jax.Array, point: jax.Array, choice: jax.Array, actions: ActionSpace) -> jax.Array:
+    """Return the action () int32 of a choice () that is allowed and ends nearest to `point` [2], m.
 
-
-def nearest_cell(mask: jax.Array, point: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return row and col () int32 of the allowed cell whose centre is nearest to `point` [2], m."""
-    centers = grid.cell_centers()
+    Args:
+        mask: [H, W, K] bool, the actions that are allowed.
+        point: [2] m.
+        choice: () int32.
+        actions: what they mean.
+    """
+    centers = grid.cell_centers(jnp)
     distance_sq = (centers[None, :] - point[0]) ** 2 + (centers[:, None] - point[1]) ** 2
-    row, col = jnp.divmod(jnp.argmin(jnp.where(mask, distance_sq, jnp.inf)), grid.GRID_SIZE)
-    return row, col
+    row, col = jnp.divmod(jnp.argmin(jnp.where(mask[..., choice], distance_sq, jnp.inf)), grid.GRID_SIZE)
+    return actions.encode(row, col, choice)

@@ -9,21 +9,21 @@ from typing import Any
 
 import jax
 
-from pregrasp_jax import policies
 from pregrasp_jax.checkpoint import load_policy
-from pregrasp_jax.config import AssetsConfig, Camera, Config, PhysicsConfig, SceneConfig
-from pregrasp_jax.env import Env, make_env, with_task
+from pregrasp_jax.config import AssetsConfig, CameraName, Config, PhysicsConfig, SceneConfig
 from pregrasp_jax.evaluation import Evaluator, Progress, evaluation_document
 from pregrasp_jax.learning.q_function import make_q_function
-from pregrasp_jax.policies import Policy
-from pregrasp_jax.training.console import announced_compilation
-from pregrasp_jax.training.program import enable_compilation_cache
+from pregrasp_jax.machine import announced_compilation, enable_compilation_cache
+from pregrasp_jax.policies import scripts
+from pregrasp_jax.policies.learned import make_learned
+from pregrasp_jax.policies.scripts import Policy
+from pregrasp_jax.task.env import Env, make_env, with_task
 
 NUM_ENVS = 16
 """Scenes side by side, enough to keep the engine's threads busy."""
 
 LOOKAHEAD_NUM_ENVS = 4
-"""The same for `lookahead`, each of whose decisions simulates `policies.LOOKAHEAD_CANDIDATES` scenes."""
+"""The same for `lookahead`, each of whose decisions simulates `scripts.LOOKAHEAD_CANDIDATES` scenes."""
 
 _PACKING = 50
 """Scenes between two lines that say how many are packed."""
@@ -50,7 +50,7 @@ class EvaluationConfig:
     assets: AssetsConfig = field(default_factory=AssetsConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
-    camera: Camera | None = None
+    camera: CameraName | None = None
     r_out: float | None = None
     obstacles_may_leave: bool = False
     episodes: int = 100
@@ -64,7 +64,7 @@ class Player:
 
     Attributes:
         policy: who decides.
-        q_values: EnvState -> Q [H, W, 2] of a learned policy, None of a script.
+        q_values: EnvState -> Q [H, W, K] of a learned policy, None of a script.
         env: the test environment.
         config: what the environment was made from.
     """
@@ -102,11 +102,11 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     if trained is None:
         return Player(_make_script(request.policy, env, config), None, env, config)
     # Of the task that it was trained on: a window of another size is another input.
-    q_function = make_q_function(config.network, trained.config.task)
+    q_function = make_q_function(config.network, trained.config.task, env.primitive.actions)
     if not q_function.fits(trained.params):
         raise ValueError(f"policy {trained.origin} does not fit its network in this version of the package")
     return Player(
-        policies.make_learned(env, q_function.values)(trained.params),
+        make_learned(env, q_function.values)(trained.params),
         lambda state: q_function.values(trained.params, state.obs, state.scene.target),
         env,
         config,
@@ -151,11 +151,11 @@ def run_evaluation(
 
 def _load(spec: str) -> Any:
     """Return the trained policy that `spec` names, None for a script."""
-    if spec in policies.SCRIPTS:
+    if spec in scripts.SCRIPTS:
         return None
     if spec == "pretrained" or Path(spec).exists():
         return load_policy(spec)
-    names = ", ".join([*policies.SCRIPTS, "pretrained"])
+    names = ", ".join([*scripts.SCRIPTS, "pretrained"])
     raise ValueError(f"policy {spec} does not exist; allowed: {names}, or a run folder of train.py")
 
 
@@ -191,4 +191,4 @@ def _make_script(name: str, env: Env, config: Config) -> Policy:
     """Return a script; `lookahead` gets an engine of its own, and no camera, which it would render for nothing."""
     if name == "lookahead":
         env = with_task(make_env(config, split="test"), camera="orthographic")
-    return policies.SCRIPTS[name](env)
+    return scripts.SCRIPTS[name](env)

@@ -11,22 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageDraw
 
-from pregrasp_jax import drawing, grid
-from pregrasp_jax.cli.player import Player
-from pregrasp_jax.env import Env
+from pregrasp_jax import drawing
+from pregrasp_jax.evaluation.player import Player
 from pregrasp_jax.evaluation.runner import MIN_BATCH
-from pregrasp_jax.heightmap import scene_hulls
-from pregrasp_jax.judge import TARGET_IN_REGION
-from pregrasp_jax.types import OPEN, REASONS, EnvState
+from pregrasp_jax.heightmap import HullInstances, scene_hulls
+from pregrasp_jax.task.env import Env
+from pregrasp_jax.types import REASONS, EnvState
 
 SECONDS_PER_FRAME = 1.5
 """s; a panel holds five pictures to look at."""
 
 _COLUMNS, _TILE = 4, (240, 320)
-
-_GRASPED = f"{REASONS[TARGET_IN_REGION]}, grasped"
-
-_hulls = jax.jit(scene_hulls)
 
 
 class Decision(NamedTuple):
@@ -36,16 +31,13 @@ class Decision(NamedTuple):
         state: unbatched.
         action: the chosen push, None after the last one.
         ending: what became of the episode, empty while it goes on.
+        success: whether the episode has ended with the target in the hand.
     """
 
     state: EnvState
     action: int | None
     ending: str
-
-    @property
-    def success(self) -> bool:
-        """Whether the episode has ended with the target in the hand."""
-        return self.ending == _GRASPED
+    success: bool = False
 
 
 def film_episodes(path: Path, player: Player, *, episodes: int, seed: int) -> None:
@@ -67,7 +59,7 @@ def draw_scenes(env: Env, indices: Iterable[int]) -> np.ndarray:
     tiles = []
     for index in indices:
         state = reset(jnp.int32(index))
-        hulls = _hulls(env.bank, state.scene, state.physics_obs)
+        hulls = env_hulls(env, state)
         view = drawing.draw_camera(hulls, target_slot=int(state.scene.target), camera=drawing.side_view(_TILE))
         picture = Image.fromarray(view)
         ImageDraw.Draw(picture).text((6, 4), f"{index}: {_target_name(env, state)}", fill=(30, 30, 30))
@@ -94,9 +86,11 @@ def make_play(player: Player, seed: int) -> Callable[[int], Iterator[Decision]]:
             if result.terminated | result.truncated:
                 break
         ending = REASONS[int(result.reason)]
-        if result.reason == TARGET_IN_REGION:
-            ending = _GRASPED if grasp(state).held else f"{ending}, grasp failed"
-        yield Decision(state, None, ending)
+        success = int(result.reason) in env.rules.successes
+        held = success and bool(grasp(state).held)
+        if success:
+            ending = f"{ending}, {'grasped' if held else 'grasp failed'}"
+        yield Decision(state, None, ending, success=held)
 
     return play
 
@@ -113,7 +107,7 @@ def in_batch(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def draw_panel(player: Player, decision: Decision) -> np.ndarray:
-    """Return scene | height | segmentation | Q closed | Q open, with the half ring and the chosen push."""
+    """Return scene | height | segmentation | one Q map per choice, with what is allowed and the chosen push."""
     return drawing.make_panel(draw_tiles(player, decision), title=" | ".join(describe_decision(player.env, decision)))
 
 
@@ -121,11 +115,11 @@ def draw_tiles(player: Player, decision: Decision) -> list[tuple[str, np.ndarray
     """Return the pictures of `draw_panel`, each with its caption."""
     env, state = player.env, decision.state
     return drawing.make_tiles(
-        _hulls(env.bank, state.scene, state.physics_obs),
+        env_hulls(env, state),
         state.obs,
         int(state.scene.target),
-        p1=tuple(np.asarray(state.p1, float)),
-        mask=np.asarray(env.action_mask(state.p1)),
+        actions=env.primitive.actions,
+        mask=np.asarray(env.action_mask(state.hand)),
         q_values=None if player.q_values is None else np.asarray(player.q_values(state)),
         action=decision.action,
     )
@@ -137,10 +131,19 @@ def describe_decision(env: Env, decision: Decision) -> tuple[str, str, str]:
     scene, target = f"scene {int(state.scene_index)}", f"target {_target_name(env, state)}"
     if decision.action is None:
         return scene, target, f"{decision.ending} after {int(state.num_pushes)} pushes"
-    row, col, aperture = grid.decode_action(jnp.int32(decision.action))
-    x, y = np.asarray(grid.cell_to_world(row, col))
-    hand = "open" if aperture == OPEN else "closed"
-    return scene, target, f"push {int(state.num_pushes) + 1}: {hand} to x {x:.2f} m, y {y:.2f} m"
+    return scene, target, f"push {int(state.num_pushes) + 1}: {describe_action(env, decision.action)}"
+
+
+def describe_action(env: Env, action: int) -> str:
+    """Return how the hand is held and where it is sent."""
+    actions = env.primitive.actions
+    (x, y), choice = actions.decode(np.int32(action))
+    return f"{actions.choices[int(choice)].name} to x {x:.2f} m, y {y:.2f} m"
+
+
+def env_hulls(env: Env, state: EnvState) -> HullInstances:
+    """Return what stands on the table of a scene, robot and walls included."""
+    return scene_hulls(env.bank, env.robot, state.scene, state.physics_obs, env.workspace)
 
 
 def _target_name(env: Env, state: EnvState) -> str:

@@ -1,0 +1,1 @@
+"""Who decides the next push: scripts, exploration, learned policies."""

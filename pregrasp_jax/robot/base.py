@@ -1,0 +1,90 @@
+"""What a robot is: a record of names and functions, so that no other stage knows a joint, a link or a finger.
+
+`robot.ur5e_rg2` is the first; docs/extend.md says how to add your own.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import mujoco
+import numpy as np
+
+from pregrasp_jax.robot.links import Links
+from pregrasp_jax.spaces.workspace import Workspace
+from pregrasp_jax.types import HandPose, HullBank
+
+
+class ClosingRegion(NamedTuple):
+    """What the closing fingers sweep, in the hand frame (x forward, y to the side), symmetric about y = 0.
+
+    Attributes:
+        x: [P] m, increasing stations along the hand; the first is the palm.
+        half_width: [P] m, half of the region's width there, linear in between.
+        exists: () bool; there is no region unless the fingers are open.
+    """
+
+    x: jax.Array | np.ndarray
+    half_width: jax.Array | np.ndarray
+    exists: jax.Array | np.ndarray | bool
+
+
+class Eligibility(NamedTuple):
+    """Which objects the hand can take.
+
+    Attributes:
+        eligible: [N] bool, host array.
+        reasons: N texts, why not; empty where eligible.
+    """
+
+    eligible: np.ndarray
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot with a hand; every function is pure, unbatched and usable under `jax.jit`, unless it says host.
+
+    Attributes:
+        name: as in `TaskConfig.robot`.
+        joints: names of the J joints of `PhysicsObservation.joint_pos`.
+        actuators: names of the A actuators, in the order of a control row.
+        start: where the hand is at the start of an episode, in host arrays.
+        home: [J] joint positions at the start, host array, rad or m.
+        links: the bodies that move, and their hulls.
+        attach: host; (spec) -> None adds bodies, actuators and constraints to a scene.
+        set_home: host; (mj_model, mj_data) -> None puts the robot at rest at `home`.
+        hand_pose: (joint_pos [J]) -> [7] pose of the grasp point in the world, x forward, z up.
+        follow: (joint_pos [J], poses [T, 7], apertures [T], workspace) -> controls [T, A] and code [T] int32, for every
+            row an index into `OBSTRUCTIONS`: what keeps the hand from that pose. Rows are `types.CTRL_DT` apart.
+        clearance: (joint_pos [J], workspace) -> () m to table and walls of what must keep clear of them.
+        closing_region: (aperture () rad) -> `ClosingRegion`; None for a hand without one.
+        eligibility: host; (hull bank) -> `Eligibility`.
+        grasp_aperture: rad, commanded to close with constant force.
+    """
+
+    name: str
+    joints: tuple[str, ...]
+    actuators: tuple[str, ...]
+    start: HandPose
+    home: np.ndarray
+    links: Links
+    attach: Callable[[mujoco.MjSpec], None]
+    set_home: Callable[[mujoco.MjModel, mujoco.MjData], None]
+    hand_pose: Callable[[jax.Array], jax.Array]
+    follow: Callable[[jax.Array, jax.Array, jax.Array, Workspace], tuple[jax.Array, jax.Array]]
+    clearance: Callable[[jax.Array, Workspace], jax.Array]
+    closing_region: Callable[[jax.Array], ClosingRegion] | None
+    eligibility: Callable[[HullBank], Eligibility]
+    grasp_aperture: float
+
+    def joint_qpos_ids(self, mj_model: mujoco.MjModel) -> np.ndarray:
+        """Return the addresses [J] in qpos of the joints."""
+        return np.array([mj_model.joint(name).qposadr[0] for name in self.joints])
+
+
+def hand_pose_of(xy: tuple[float, float], *, z: float, yaw: float, aperture: float) -> HandPose:
+    """Return a pose in host arrays, float32."""
+    x, y = xy
+    return HandPose(np.array([x, y], np.float32), *map(np.float32, (z, yaw, aperture)))  # pyright: ignore[reportArgumentType]

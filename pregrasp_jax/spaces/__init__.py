@@ -1,0 +1,1 @@
+"""What is said about the task without simulating it: grid, actions, workspace."""

@@ -1,0 +1,1 @@
+"""The task: pushes, rules and the environment that puts them together."""

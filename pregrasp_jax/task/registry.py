@@ -1,0 +1,35 @@
+"""Kinds of task, chosen by name: a primitive, and the rules by which it is judged."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from pregrasp_jax.task import push, rules
+from pregrasp_jax.task.primitive import Primitive
+from pregrasp_jax.task.rules import Rules
+
+
+class Kind(NamedTuple):
+    """How to make a task of this kind.
+
+    Attributes:
+        make_primitive: (robot, workspace, task config, *, max_distance m) -> `Primitive`.
+        make_rules: (robot, workspace, primitive, hull bank, task config) -> `Rules`.
+    """
+
+    make_primitive: Callable[..., Primitive]
+    make_rules: Callable[..., Rules]
+
+
+KINDS: dict[str, Kind] = {"push": Kind(push.make_push, rules.make_rules)}
+"""Kinds by the name that `task.primitive` knows them by; add your own before you make an environment."""
+
+
+def get_kind(name: str) -> Kind:
+    """Return the kind of task called `name`.
+
+    Raises:
+        ValueError: there is none; the line lists those that exist.
+    """
+    if name not in KINDS:
+        raise ValueError(f"task.primitive = {name!r} does not exist; allowed: {', '.join(sorted(KINDS))}")
+    return KINDS[name]
