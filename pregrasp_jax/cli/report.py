@@ -11,10 +11,11 @@ from pregrasp_jax.cli.evaluate import refuse_unwritable
 from pregrasp_jax.config import AssetsConfig
 from pregrasp_jax.evaluation import load_evaluation
 from pregrasp_jax.evaluation.player import EvaluationConfig, Player, make_player
+from pregrasp_jax.evaluation.runner import Decision
 from pregrasp_jax.machine import enable_compilation_cache
 from pregrasp_jax.report import Film, RunRecord, Step, load_evaluations, read_run, write_report
 from pregrasp_jax.report.page import REPORT, kept_episodes
-from pregrasp_jax.report.play import Decision, describe_decision, draw_tiles, make_play
+from pregrasp_jax.report.play import describe_decision, draw_tiles, make_play
 from pregrasp_jax.report.record import SECONDS
 from pregrasp_jax.report.results import evaluation_files, is_of_run
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw
 
@@ -10,9 +9,25 @@ from pregrasp_jax.drawing.shaded import instance_colors
 from pregrasp_jax.spaces import grid
 
 
+def _stops(text: str) -> np.ndarray:
+    """Return colours [17, 3], 0 to 255, that are as far apart as the values they stand for."""
+    return np.array([list(bytes.fromhex(color)) for color in text.split()], float)
+
+
+_CIVIDIS = _stops(
+    "00224e 002e6a 1a386f 32436d 434e6c 535a6d 61656f 6f7073 7d7c78 8c8878 9b9476 aba072 bcae6c cdbb63 dec958 f0d846 "
+    "fee838"
+)
+_INFERNO = _stops(
+    "000004 0b0724 210c4a 3d0965 57106e 71196e 8a226a a32c61 bc3754 d24644 e45a31 f1731d f98e09 fcac11 f9cb35 f2ea69 "
+    "fcffa4"
+)
+"""Perceptually uniform, also for the colour-blind: cividis (Nunez et al. 2018) and inferno (van der Walt 2015)."""
+
+
 def draw_heightmap(height: np.ndarray, *, size: int = 300) -> np.ndarray:
     """Draw heights [H, W], uint8 as observed, as a map of size x size pixels; brighter is higher."""
-    return _as_map(matplotlib.colormaps["cividis"](np.asarray(height, np.uint8))[..., :3] * 255, size)
+    return _as_map(_colors(np.asarray(height, np.uint8) / 255, _CIVIDIS), size)
 
 
 def draw_segmentation(instance_ids: np.ndarray, *, target_slot: int | None = None, size: int = 300) -> np.ndarray:
@@ -45,7 +60,7 @@ def draw_q_map(
     q, mask = np.asarray(q, float), np.asarray(mask, bool)
     inside = q[mask] if mask.any() else np.zeros(1)
     low, high = limits or (inside.min(), inside.max())
-    colors = matplotlib.colormaps["inferno"](np.clip((q - low) / max(high - low, 1e-9), 0, 1))[..., :3] * 255
+    colors = _colors((q - low) / max(high - low, 1e-9), _INFERNO)
     shade = np.zeros(q.shape) if backdrop is None else np.asarray(backdrop, float) / 255
     image = _as_map(np.where(mask[..., None], colors, 70 + 110 * shade[..., None]), size)
     picture = Image.fromarray(image)
@@ -57,6 +72,12 @@ def draw_q_map(
     if push is not None:
         _draw_arrow(canvas, *(_to_pixel(point, size) for point in push))
     return np.asarray(picture)
+
+
+def _colors(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
+    """Return the colours [..., 3], 0 to 255, of values [...], which are clipped to [0, 1]."""
+    at = np.linspace(0.0, 1.0, len(stops))
+    return np.stack([np.interp(values, at, channel) for channel in stops.T], axis=-1)
 
 
 def _as_map(values: np.ndarray, size: int) -> np.ndarray:

@@ -6,7 +6,7 @@ every scene runs to its end and with `native` no result depends on `num_envs`: k
 """
 
 from collections.abc import Callable, Hashable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.struct as struct
 import jax
@@ -38,12 +38,35 @@ class _Run(struct.PyTreeNode):
         reason: () int32, `RUNNING` until the episode ends.
         return_: () float32, rewards so far.
         seconds: () float32 s, time spent on motions so far.
+        action: () int32, the last one decided; -1 before the first.
     """
 
     state: EnvState
     reason: jax.Array
     return_: jax.Array
     seconds: jax.Array
+    action: jax.Array
+
+
+class Decision(NamedTuple):
+    """A state and what was done in it.
+
+    Attributes:
+        state: unbatched, on the host.
+        action: the chosen push, None after the last one.
+        reason: why the episode has ended, as in `Episode.reason`; empty while it goes on.
+        success: whether it has ended in one.
+    """
+
+    state: EnvState
+    action: int | None
+    reason: str = ""
+    success: bool = False
+
+    @property
+    def ending(self) -> str:
+        """Return how the episode has ended, in words."""
+        return f"{self.reason}, grasped" if self.success else self.reason
 
 
 class Evaluator:
@@ -113,7 +136,7 @@ class Evaluator:
                 progress(len(finished), episodes, sum(episode.success for episode in finished))
 
         for run in self._run_to_ends(policy, episodes, jax.random.key(seed)):
-            if with_grasp and run.reason in self._env.rules.successes:
+            if self._asks_for_grasp(run, with_grasp):
                 enclosed.append(run)
             else:
                 finish([self._episode(run)])
@@ -122,6 +145,28 @@ class Evaluator:
                 enclosed.clear()
         finish(self._grasp_all(enclosed))
         return EvaluationResult(tuple(sorted(finished, key=lambda episode: episode.scene)))
+
+    def play(self, policy: Policy, scene: int, *, seed: int = 0, with_grasp: bool = True) -> Iterator[Decision]:
+        """Yield the decisions of one scene, the last of which is the end of the episode: exactly what `run` counts.
+
+        Args:
+            policy: see `policies.scripts`.
+            scene: row of the scene bank.
+            seed: as in `run`.
+            with_grasp: as in `run`.
+        """
+        policy, key = _bound(policy), jax.random.key(seed)
+        runs = self._call(self._start, np.full(MIN_BATCH, scene, np.int32))
+        run = _first(runs)
+        while run.reason == RUNNING:
+            runs, before = self._call(self._push, policy, runs, key), run
+            run = _first(runs)
+            yield Decision(before.state, int(run.action))
+        (episode,) = self._grasp_all([run]) if self._asks_for_grasp(run, with_grasp) else [self._episode(run)]
+        yield Decision(run.state, None, episode.reason, episode.success)
+
+    def _asks_for_grasp(self, run: _Run, with_grasp: bool) -> bool:
+        return with_grasp and int(run.reason) in self._env.rules.successes
 
     def _run_to_ends(self, policy: Policy, episodes: int, key: jax.Array) -> Iterator[_Run]:
         """Yield every scene when its pushes have ended, as host arrays."""
@@ -186,7 +231,7 @@ class Evaluator:
         )
 
     def _start_one(self, index: jax.Array) -> _Run:
-        return _Run(self._env.reset_to(index), jnp.int32(RUNNING), jnp.float32(0.0), jnp.float32(0.0))
+        return _Run(self._env.reset_to(index), jnp.int32(RUNNING), jnp.float32(0.0), jnp.float32(0.0), jnp.int32(-1))
 
     def _restart_one(self, run: _Run, index: jax.Array) -> _Run:
         """Return scene `index` if it is not negative, else `run`."""
@@ -196,13 +241,14 @@ class Evaluator:
         """Let the policy decide, and plan; an ended run stays where it is."""
         state = run.state
         key = jax.random.fold_in(jax.random.fold_in(key, state.scene_index), state.num_pushes)
-        plan = self._env.plan(state, policy(state, key)).unless(run.reason != RUNNING, "no_ik")
-        return state.physics, plan, run
+        action = policy(state, key)
+        plan = self._env.plan(state, action).unless(run.reason != RUNNING, "no_ik")
+        return state.physics, plan, run.replace(action=action)
 
     def _conclude_one(self, run: _Run, plan: Plan, physics: Any) -> _Run:
         """Return the run after a push; an ended run stays as it is."""
         state, result = self._env.conclude(run.state, plan, physics)
-        pushed = _Run(state, result.reason, run.return_ + result.reward, run.seconds + result.seconds)
+        pushed = _Run(state, result.reason, run.return_ + result.reward, run.seconds + result.seconds, run.action)
         return _where(run.reason == RUNNING, pushed, run)
 
     def _plan_grasp_one(self, state: EnvState) -> tuple[Any, Plan, Any]:
@@ -232,6 +278,11 @@ def evaluate_policy(
 def _bound(policy: Policy) -> Partial:
     """Return a policy as a pytree."""
     return policy if isinstance(policy, Partial) else Partial(policy)
+
+
+def _first(runs: _Run) -> _Run:
+    """Return the first run of a batch, on the host."""
+    return jax.tree.map(lambda leaf: leaf[0], jax.device_get(runs))
 
 
 def _where(condition: jax.Array, when: Any, otherwise: Any) -> Any:

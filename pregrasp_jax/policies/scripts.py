@@ -9,6 +9,7 @@ import flax.struct as struct
 import jax
 import jax.numpy as jnp
 
+from pregrasp_jax.config import ExplorationConfig
 from pregrasp_jax.policies.exploration import guided_action, random_action
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace
@@ -30,8 +31,8 @@ LOOKAHEAD_CONTINUATION = 3
 _SUCCESS, _FAILURE = 10.0, -10.0
 """What a grasp that holds and a failed push are worth to `lookahead`, above and below minus every distance."""
 
-_GUIDED = {"angle_std": 0.5, "open_probability": 0.7}
-"""`ExplorationConfig`'s defaults: the `guided` policy is what exploration looks like at epsilon 1."""
+_GUIDED = {name: getattr(ExplorationConfig(), name) for name in ("angle_std", "open_probability")}
+"""The `guided` policy is what exploration looks like at epsilon 1."""
 
 
 def make_random(env: Env) -> Policy:

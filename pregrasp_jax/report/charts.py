@@ -8,7 +8,7 @@ from pregrasp_jax.evaluation.statistics import is_interval, is_number
 from pregrasp_jax.report.markup import Markup, element, join
 from pregrasp_jax.report.record import SECONDS, RunRecord
 from pregrasp_jax.report.svg import Point, Series, bar_chart, line_chart
-from pregrasp_jax.training.trainer import PHASES
+from pregrasp_jax.training.recorder import PHASES
 
 RECENT_EPISODES = 1000
 """Training episodes whose ends are counted, at least."""

@@ -1,10 +1,11 @@
 """Pictures of policies at work: one decision, whole episodes, and the scenes of a bank."""
 
 import collections
+import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,31 +14,15 @@ from PIL import Image, ImageDraw
 
 from pregrasp_jax import drawing
 from pregrasp_jax.evaluation.player import Player
-from pregrasp_jax.evaluation.runner import MIN_BATCH
+from pregrasp_jax.evaluation.runner import MIN_BATCH, Decision, Evaluator
 from pregrasp_jax.heightmap import HullInstances, scene_hulls
 from pregrasp_jax.task.env import Env
-from pregrasp_jax.types import REASONS, EnvState
+from pregrasp_jax.types import EnvState
 
 SECONDS_PER_FRAME = 1.5
 """s; a panel holds five pictures to look at."""
 
 _COLUMNS, _TILE = 4, (240, 320)
-
-
-class Decision(NamedTuple):
-    """A state and what was done in it.
-
-    Attributes:
-        state: unbatched.
-        action: the chosen push, None after the last one.
-        ending: what became of the episode, empty while it goes on.
-        success: whether the episode has ended with the target in the hand.
-    """
-
-    state: EnvState
-    action: int | None
-    ending: str
-    success: bool = False
 
 
 def film_episodes(path: Path, player: Player, *, episodes: int, seed: int) -> None:
@@ -71,28 +56,9 @@ def draw_scenes(env: Env, indices: Iterable[int]) -> np.ndarray:
 def make_play(player: Player, seed: int) -> Callable[[int], Iterator[Decision]]:
     """Return the function scene -> its decisions, one at a time, the last of which is the end of the episode.
 
-    Keys and rounding are those of `evaluation.Evaluator`, so what is drawn is what was counted.
+    What is drawn is what an evaluation counts: the programs are the same.
     """
-    env = player.env
-    reset, step, decide, grasp = (in_batch(f) for f in (env.reset_to, env.step, player.policy, env.grasp))
-
-    def play(scene: int) -> Iterator[Decision]:
-        state = reset(jnp.int32(scene))
-        scene_key = jax.random.fold_in(jax.random.key(seed), scene)
-        while True:
-            action = decide(state, jax.random.fold_in(scene_key, state.num_pushes))
-            yield Decision(state, int(action), "")
-            state, result = step(state, action)
-            if result.terminated | result.truncated:
-                break
-        ending = REASONS[int(result.reason)]
-        success = int(result.reason) in env.rules.successes
-        held = success and bool(grasp(state).held)
-        if success:
-            ending = f"{ending}, {'grasped' if held else 'grasp failed'}"
-        yield Decision(state, None, ending, success=held)
-
-    return play
+    return functools.partial(Evaluator(player.env, num_envs=MIN_BATCH).play, player.policy, seed=seed)
 
 
 def in_batch(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -297,7 +297,7 @@ def _count(
     )
 
 
-def report(tally: Tally, successes: Sequence[int]) -> dict[str, Any]:
+def metrics(tally: Tally, successes: Sequence[int]) -> dict[str, Any]:
     """Return the row of metrics () of a tally, on the host; shares without a case are None.
 
     Args:

@@ -146,10 +146,10 @@ def _accumulate(total: dict[str, jax.Array], new: dict[str, jax.Array], count: j
     return {name: merge(name) for name in METRICS}
 
 
-def report(state: Learning) -> dict[str, Any]:
+def metrics(state: Learning) -> dict[str, Any]:
     """Return the row of metrics () of a learner, on the host; averages over no update are None."""
     small = (state.learner.gradient_steps, state.updates, state.metrics)
-    gradient_steps, updates, metrics = jax.device_get(small)
+    gradient_steps, updates, sums = jax.device_get(small)
     replay = state.replay
     sizes = (replay.num_alive, replay.observations_written, replay.hindsight_rows_written, replay.rows_written)
     alive, observations, hindsight_rows, rows = map(int, jax.device_get(sizes))
@@ -157,7 +157,7 @@ def report(state: Learning) -> dict[str, Any]:
     def value(name: str) -> float | None:
         if not updates:
             return None
-        return float(metrics[name]) / (1 if name.endswith(("_max", "_min")) else int(updates))
+        return float(sums[name]) / (1 if name.endswith(("_max", "_min")) else int(updates))
 
     return {
         "gradient_steps": int(gradient_steps),

@@ -14,15 +14,16 @@ from pregrasp_jax.learning.q_function import Params, make_q_function
 from pregrasp_jax.machine import enable_compilation_cache
 from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.task.env import Env, make_env
-from pregrasp_jax.training import processes, resources
+from pregrasp_jax.training import processes, resources, trainer
 from pregrasp_jax.training.console import Console
-from pregrasp_jax.training.dump import make_dump
+from pregrasp_jax.training.dump import DumpFn, make_dump
 from pregrasp_jax.training.event_log import require_module
 from pregrasp_jax.training.interrupt import Interrupt
-from pregrasp_jax.training.program import make_program
+from pregrasp_jax.training.program import Program, make_program
+from pregrasp_jax.training.recorder import EvaluateFn, Recorder
 from pregrasp_jax.training.run_folder import RunFolder, WatchedFolder, refuse_used
 from pregrasp_jax.training.sharding import make_layout
-from pregrasp_jax.training.trainer import CompileFn, EvaluateFn, Trainer
+from pregrasp_jax.training.trainer import CompileFn, Trainer
 
 VALIDATION_ENVS = 16
 """Validation scenes side by side; the result does not depend on it."""
@@ -81,16 +82,50 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
     resumed, folder = folder is not None, folder or _create(run_dir, config)
     evaluate, compile_evaluation = make_evaluate(validation, config)
     dump = make_dump(env, config)
-    trainer = Trainer(config, folder, program, evaluate, dump, console, compile_evaluation=compile_evaluation)
     with folder, Interrupt(console.say, console.close) as interrupt:
         folder.begin_session(config, hashes)
-        (trainer.resume if processes.agreed(resumed and folder.has_checkpoint) else trainer.begin)()
+        session = make_trainer(
+            config,
+            folder,
+            program,
+            evaluate,
+            dump,
+            console,
+            resumed=processes.agreed(resumed and folder.has_checkpoint),
+            compile_evaluation=compile_evaluation,
+        )
         try:
-            ending = trainer.run(lambda: interrupt.exit_code is not None)
+            ending = session.run(lambda: interrupt.exit_code is not None)
         finally:
             console.close()
         console.say(ending)
-        return interrupt.exit_code or (0 if trainer.saved else 1)
+        return interrupt.exit_code or (0 if session.recorder.saved else 1)
+
+
+def make_trainer(
+    config: Config,
+    folder: RunFolder,
+    program: Program,
+    evaluate: EvaluateFn,
+    dump: DumpFn,
+    console: Console,
+    *,
+    resumed: bool,
+    compile_evaluation: CompileFn = lambda params: None,
+) -> Trainer:
+    """Return the trainer of a session: from the newest checkpoint if `resumed`, else from the seed.
+
+    Raises:
+        ValueError: the checkpoint cannot be read, or the first one cannot be written.
+    """
+    options = {"evaluate": evaluate, "dump": dump, "console": console}
+    if resumed:
+        state, counters = trainer.resume(program, folder, console, tensorboard=config.train.tensorboard)
+        recorder = Recorder(config, folder, program, counters=counters, **options)
+    else:
+        recorder = Recorder(config, folder, program, **options)
+        state = trainer.begin(program, recorder)
+    return Trainer(program, recorder, state, compile_evaluation=compile_evaluation)
 
 
 def make_evaluate(env: Env, config: Config) -> tuple[EvaluateFn, CompileFn]:
