@@ -16,7 +16,7 @@ import yaml
 
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint import trees
-from pregrasp_jax.checkpoint.state import read_newest_arrays
+from pregrasp_jax.checkpoint.state import read_newest_policy
 from pregrasp_jax.checkpoint.trees import DamagedFileError
 from pregrasp_jax.config import Config, from_dict, to_dict
 
@@ -25,9 +25,6 @@ FORMAT = "pregrasp_jax policy 2"
 
 _FORMAT_1 = "pregrasp_jax policy 1"
 """Of earlier runs; its checksum covers the parameters alone."""
-
-PARAMS_PREFIX = "learning/learner/target_params/"
-"""Where a training state keeps what a policy needs."""
 
 PRETRAINED = Path(__file__).parent.parent / "pretrained"
 """The policy that ships with the package."""
@@ -127,6 +124,5 @@ def _checksum(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> 
 
 
 def _policy_of_checkpoint(folder: Path, config: Config) -> Policy:
-    arrays, origin = read_newest_arrays(folder)
-    params = {name.removeprefix(PARAMS_PREFIX): leaf for name, leaf in arrays.items() if name.startswith(PARAMS_PREFIX)}
+    params, origin = read_newest_policy(folder)
     return Policy(trees.nest(params), config, {}, origin)

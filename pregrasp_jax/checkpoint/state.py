@@ -31,6 +31,9 @@ FORMAT = 1
 KEEP = 3
 """Checkpoints kept: two to fall back to."""
 
+_FIRST_POLICY = "learning/learner/target_params/"
+"""What `save` was told in runs whose manifests do not say so."""
+
 _STATE, _MANIFEST, _REPLAY = "state.safetensors", "manifest.json", "replay"
 
 
@@ -55,7 +58,7 @@ class Restored:
     problems: tuple[str, ...]
 
 
-def save(folder: Path, step: int, tree: Any, ring: Ring, extra: dict[str, Any]) -> Path:
+def save(folder: Path, step: int, tree: Any, ring: Ring, extra: dict[str, Any], *, policy: str) -> Path:
     """Write a checkpoint, then delete what is older than the last `KEEP`.
 
     A crash at any instant leaves the previous checkpoints intact.
@@ -66,6 +69,7 @@ def save(folder: Path, step: int, tree: Any, ring: Ring, extra: dict[str, Any]) 
         tree: pytree of arrays, without the contents of the ring.
         ring: observations; only those since the last checkpoint are written.
         extra: JSON-able, for what lives on the host.
+        policy: how the names of the leaves begin that a policy needs, its parameters.
 
     Returns:
         The folder of the checkpoint.
@@ -86,6 +90,7 @@ def save(folder: Path, step: int, tree: Any, ring: Ring, extra: dict[str, Any]) 
             "step": step,
             "state_sha256": hashlib.sha256(state).hexdigest(),
             "state_checksum": trees.checksum(tree),
+            "policy": policy,
             "observations": ring.written,
             "chunks": [list(chunk) for chunk in current],
             "extra": extra,
@@ -167,15 +172,18 @@ def _settle_for(path: Path, damaged: dict[Path, str], template: Any, ring_templa
     return dataclasses.replace(restored, problems=(*(damaged[broken] for broken in newer), *restored.problems))
 
 
-def read_newest_arrays(folder: Path) -> tuple[dict[str, np.ndarray], Path]:
-    """Return the leaves of the newest intact checkpoint by path, and its file; changes nothing on disk.
+def read_newest_policy(folder: Path) -> tuple[dict[str, np.ndarray], Path]:
+    """Return the parameters of the newest intact checkpoint by name, and its file; changes nothing on disk.
 
     Raises:
         ValueError: there is none.
     """
     for path in _newest_first(folder):
         try:
-            return _read_state(path, _read_manifest(path)), path / _STATE
+            manifest = _read_manifest(path)
+            arrays, prefix = _read_state(path, manifest), manifest.get("policy", _FIRST_POLICY)
+            named = {name.removeprefix(prefix): leaf for name, leaf in arrays.items() if name.startswith(prefix)}
+            return named, path / _STATE
         except DamagedFileError:
             continue
     raise ValueError(f"{folder} holds no intact checkpoint")

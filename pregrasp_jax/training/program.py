@@ -27,6 +27,10 @@ from pregrasp_jax.training.learn import (
 from pregrasp_jax.training.sharding import Layout
 
 
+POLICY = "learning/learner/target_params/"
+"""How the names of the leaves of a `TrainState` begin that a policy needs: the average is the better policy."""
+
+
 class TrainState(struct.PyTreeNode):
     """Everything that a training must remember; two equal ones continue equally.
 

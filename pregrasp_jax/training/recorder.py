@@ -14,7 +14,7 @@ from pregrasp_jax.training import collect, learn, processes
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.dump import DumpFn
 from pregrasp_jax.training.mishap import NONE
-from pregrasp_jax.training.program import Program, TrainState
+from pregrasp_jax.training.program import POLICY, Program, TrainState
 from pregrasp_jax.training.run_folder import RunFolder
 
 EvaluateFn = Callable[[Params], dict[str, Any]]
@@ -179,7 +179,9 @@ class Recorder:
         with counters.timed("checkpoint"):
             written = self._write(
                 "checkpoint",
-                lambda: save(self.folder.checkpoints, counters.env_steps, rest, ring, dict(vars(counters))),
+                lambda: save(
+                    self.folder.checkpoints, counters.env_steps, rest, ring, dict(vars(counters)), policy=POLICY
+                ),
             )
         self._tried_to_save_at = counters.total_seconds
         if processes.agreed(written):
