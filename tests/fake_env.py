@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax.spaces import grid
 from pregrasp_jax.config import TaskConfig
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.task.rules import judge
 from pregrasp_jax.types import (
     MAX_OBJECTS,

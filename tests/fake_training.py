@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from fake_env import FakeEnv
 
-from pregrasp_jax.spaces import grid
 from pregrasp_jax.config import PRESETS, Config, from_dict, to_dict
 from pregrasp_jax.learning.q_function import QFunction
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.training import program
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.dump import make_dump

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from pregrasp_jax import heightmap
-from pregrasp_jax.spaces import grid
-from pregrasp_jax.task import push
 from pregrasp_jax.config import PRESETS, NetworkConfig, TaskConfig
 from pregrasp_jax.learning.compact import (
     PATCH,
@@ -25,6 +23,8 @@ from pregrasp_jax.learning.compact import (
 from pregrasp_jax.learning.networks import num_parameters
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.robot import model as robot
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.task import push
 from pregrasp_jax.types import Observation
 
 START = tuple(robot.START_POSE[:2])

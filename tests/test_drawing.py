@@ -7,10 +7,10 @@ from heightmap_oracle import box_cloud, make_instances, pad
 from PIL import Image
 
 from pregrasp_jax import drawing
-from pregrasp_jax.spaces import grid
 from pregrasp_jax.assets.bank import select
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.drawing import shaded
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.types import OPEN, ROBOT_ID, Observation
 
 SHAPE = (60, 80)

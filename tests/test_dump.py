@@ -18,10 +18,10 @@ from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.cli.replay import Replay, make_replay, make_replay_env
 from pregrasp_jax.config import Config, ExplorationConfig
-from pregrasp_jax.task.env import Env
 from pregrasp_jax.physics import make_engine
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.scene.model import parking_poses
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.training.dump import load_dump
 from pregrasp_jax.training.mishap import NONE, no_mishap
 from pregrasp_jax.types import MAX_OBJECTS, REASONS

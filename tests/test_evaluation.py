@@ -13,11 +13,11 @@ import pytest
 from fake_env import FakeEnv, fake_env, make_scenes
 from jax.tree_util import Partial
 
-from pregrasp_jax.spaces import grid
-from pregrasp_jax.policies import scripts
 from pregrasp_jax.config import Config, SceneConfig, TaskConfig
-from pregrasp_jax.task.env import make_env
 from pregrasp_jax.evaluation import Episode, EvaluationResult, Evaluator, evaluate_policy, results
+from pregrasp_jax.policies import scripts
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.task.env import make_env
 from pregrasp_jax.types import OPEN, REASONS, EnvState, GraspResult, Observation
 
 ENV = fake_env()

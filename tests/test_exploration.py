@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pregrasp_jax.config import ExplorationConfig
 from pregrasp_jax.policies import exploration
 from pregrasp_jax.spaces import grid
-from pregrasp_jax.config import ExplorationConfig
 from pregrasp_jax.training.collect import epsilon_at
 
 R_IN, R_OUT = 0.04, 0.15

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pregrasp_jax.task.rules import judge
 from pregrasp_jax.learning import hindsight, replay
+from pregrasp_jax.task.rules import judge
 from pregrasp_jax.types import MAX_OBJECTS, REASONS, Observation, Outcome
 
 MAX_PUSHES = 5

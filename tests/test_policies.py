@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from fake_env import UNREACHABLE_ROWS, FakeEnv, fake_env, make_scenes
 
-from pregrasp_jax.spaces import grid
-from pregrasp_jax.policies import scripts
 from pregrasp_jax.config import TaskConfig
+from pregrasp_jax.policies import scripts
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.task.rules import TARGET_IN_REGION
 from pregrasp_jax.types import CLOSED, OPEN, REASONS, EnvState, GraspResult, Observation
 

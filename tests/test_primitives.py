@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pregrasp_jax.spaces import grid
-from pregrasp_jax.task import push
 from pregrasp_jax.physics.base import CTRL_DT
 from pregrasp_jax.robot import kinematics
 from pregrasp_jax.robot import model as robot
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.task import push
 from pregrasp_jax.types import CLOSED, OPEN
 
 SPEED = 0.1

@@ -12,9 +12,9 @@ import numpy as np
 import optax
 import pytest
 
+from pregrasp_jax.learning import hindsight, learner, replay
 from pregrasp_jax.spaces.grid import GRID_SIZE
 from pregrasp_jax.task.rules import judge
-from pregrasp_jax.learning import hindsight, learner, replay
 from pregrasp_jax.types import MAX_OBJECTS, Observation, Outcome
 
 GAMMA = 0.5

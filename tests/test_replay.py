@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pregrasp_jax.spaces import grid
 from pregrasp_jax.learning import hindsight, replay
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.types import MAX_OBJECTS, Observation, Outcome
 
 NUM_ENVS, MAX_PUSHES = 3, 4

@@ -26,7 +26,6 @@ from pregrasp_jax.training.learn import (
 )
 from pregrasp_jax.training.sharding import Layout
 
-
 POLICY = "learning/learner/target_params/"
 """How the names of the leaves of a `TrainState` begin that a policy needs: the average is the better policy."""
 
