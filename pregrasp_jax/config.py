@@ -41,7 +41,7 @@ class SceneConfig:
     validation_scenes: int = 50
     """Scenes on which checkpoints are compared during training."""
     test_scenes: int = 200
-    """Scenes of `evaluate.py`, with fixed yaw and target."""
+    """Scenes of `pregrasp-jax evaluate`, with fixed yaw and target."""
     bank_seed: int = 0
     """Seed of the banks; training, validation and test draw from disjoint streams of it."""
 

@@ -222,7 +222,7 @@ SCRIPTS: dict[str, Callable[[Env], Policy]] = {
     "clear": make_clear,
     "lookahead": make_lookahead,
 }
-"""Policies that need no training, by the name `evaluate.py --policy` knows them by."""
+"""Policies that need no training, by the name `pregrasp-jax evaluate --policy` knows them by."""
 
 
 def target_xy(state: EnvState) -> jax.Array:

@@ -9,7 +9,7 @@ import pregrasp_jax
 
 PACKAGE = Path(pregrasp_jax.__file__).parent
 ORDER = [
-    ["command_line", "io", "machine", "types"],
+    ["io", "machine", "types"],
     ["config", "geometry", "grid", "judge"],
     ["assets"],
     ["robot"],

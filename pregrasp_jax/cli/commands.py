@@ -1,4 +1,4 @@
-"""The subcommands of `python -m pregrasp_jax`; their docstrings are the help."""
+"""The subcommands of `pregrasp-jax`; their docstrings are the help."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -54,7 +54,7 @@ def compare(a: Path, b: Path, /, *, json: Path | None = None) -> None:
     """Compare two evaluations on the same scenes: intervals, and McNemar's exact test of their difference.
 
     Args:
-        a: file written by `evaluate.py --json`.
+        a: file written by `pregrasp-jax evaluate --json`.
         b: another, of the same scenes.
         json: write the comparison here.
     """
@@ -109,7 +109,7 @@ def show(
     """Draw one decision: camera view, heightmaps, Q maps of a learned policy, and the push it chooses.
 
     Args:
-        policy: who decides; a name or run folder as in `evaluate.py`.
+        policy: who decides; a name or run folder as in `pregrasp-jax evaluate`.
         scene: test scene.
         pushes: let the policy push so often before the picture is taken.
         object_dir: folder of meshes; the built-in catalogue if left out.

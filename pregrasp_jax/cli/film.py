@@ -28,6 +28,9 @@ _GRASPED = f"{REASONS[TARGET_IN_REGION]}, grasped"
 
 _hulls = jax.jit(scene_hulls)
 
+Tiles = list[tuple[str, np.ndarray]]
+"""Pictures of one decision, each with its caption."""
+
 
 class Decision(NamedTuple):
     """A state and what was done in it.
@@ -114,10 +117,15 @@ def in_batch(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def draw_panel(player: Player, decision: Decision) -> np.ndarray:
     """Return scene | height | segmentation | Q closed | Q open, with the half ring and the chosen push."""
-    return drawing.make_panel(draw_tiles(player, decision), title=" | ".join(describe_decision(player.env, decision)))
+    return make_panel(player.env, decision, draw_tiles(player, decision))
 
 
-def draw_tiles(player: Player, decision: Decision) -> list[tuple[str, np.ndarray]]:
+def make_panel(env: Env, decision: Decision, tiles: Tiles) -> np.ndarray:
+    """Return the pictures of a decision side by side under a title."""
+    return drawing.make_panel(tiles, title=" | ".join(describe_decision(env, decision)))
+
+
+def draw_tiles(player: Player, decision: Decision) -> Tiles:
     """Return the pictures of `draw_panel`, each with its caption."""
     env, state = player.env, decision.state
     return drawing.make_tiles(

@@ -1,4 +1,4 @@
-"""What `evaluate.py` does: find the policy, make the environment it belongs to, run it, describe the result."""
+"""An evaluation: find the policy, make the environment it belongs to, run it, describe the result."""
 
 import dataclasses
 import time
@@ -156,7 +156,7 @@ def _load(spec: str) -> Any:
     if spec == "pretrained" or Path(spec).exists():
         return load_policy(spec)
     names = ", ".join([*policies.SCRIPTS, "pretrained"])
-    raise ValueError(f"policy {spec} does not exist; allowed: {names}, or a run folder of train.py")
+    raise ValueError(f"policy {spec} does not exist; allowed: {names}, or a run folder")
 
 
 def _environment_config(request: EvaluationConfig, trained: Config) -> Config:

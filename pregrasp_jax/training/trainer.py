@@ -189,7 +189,7 @@ class Trainer:
         self.dump()
         self.save()
         step, path = self.progress.env_steps, self.folder.path
-        return f"interrupted at step {step}; continue with `python train.py resume {path}`"
+        return f"interrupted at step {step}; continue with `pregrasp-jax train resume {path}`"
 
     def _step(self, program: Program) -> None:
         """Push in every scene and learn from it: once, or as often as the program does without the host."""
@@ -273,7 +273,7 @@ class Trainer:
             if path := self.dump_fn(self.folder.dumps, mishap):
                 self.console.say(
                     f"the physics diverged at step {int(mishap.env_steps)} in scene {int(mishap.scene)}; "
-                    f"`python -m pregrasp_jax replay-dump {path}` repeats the push"
+                    f"`pregrasp-jax replay-dump {path}` repeats the push"
                 )
 
         self._write("dump", write)
