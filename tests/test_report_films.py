@@ -205,7 +205,7 @@ def test_the_demo_leaves_its_evaluations_and_a_report_with_films(
 ) -> None:
     _save_policy(run_dir)
     shipped: list[str] = []
-    monkeypatch.setattr(demo_module, "show_shipped", lambda folder, _: shipped.append("shown"))
+    monkeypatch.setattr(demo_module, "show_shipped", lambda _: shipped.append("shown"))
     monkeypatch.setattr(demo_module, "resume", lambda *_: shipped.append("trained") or 0)
     # The shipped policy and the other scripts would only compile for longer.
     monkeypatch.setattr(demo_module, "_SCRIPTS", ("clear",))

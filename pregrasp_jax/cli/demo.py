@@ -39,7 +39,7 @@ def demo(*, run_dir: Path = Path("runs/demo"), minutes: float = 5.0, episodes: i
     if not (run_dir / "config.yaml").exists():
         with RunFolder.create(run_dir, config):
             pass  # it is refused, or taken, before anything is played
-    show_shipped(run_dir, config.scene)
+    show_shipped(run_dir)
     if code := resume(config, run_dir):
         raise SystemExit(code)
     players, documents = {}, {}
@@ -57,19 +57,18 @@ def demo(*, run_dir: Path = Path("runs/demo"), minutes: float = 5.0, episodes: i
     print(f"wrote {page}: results, learning curves and episodes of the run")
 
 
-def show_shipped(
-    folder: Path, scene: SceneConfig, *, say: Callable[[str], None] = lambda line: print(line, file=sys.stderr)
-) -> None:
+def show_shipped(folder: Path, *, say: Callable[[str], None] = lambda line: print(line, file=sys.stderr)) -> None:
     """Write a film and a page of the first test scenes as the shipped policy plays them.
 
     Args:
         folder: gets `demo.gif` and `pretrained.html`.
-        scene: which test scenes.
         say: told how far it is.
     """
     say(f"{_SHIPPED} plays {_FILMED} test scenes; the first one waits for the compiler")
     enable_compilation_cache()
-    player = make_player(EvaluationConfig(policy=_SHIPPED, scene=scene, episodes=_FILMED), say=say)
+    player = make_player(
+        EvaluationConfig(policy=_SHIPPED, scene=SceneConfig(test_scenes=_FILMED), episodes=_FILMED), say=say
+    )
     play = make_play(player, seed=0)
     drawn = []
     for index in range(_FILMED):

@@ -1,6 +1,7 @@
 """An evaluation: find the policy, make the environment it belongs to, run it, describe the result."""
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -105,12 +106,9 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     q_function = make_q_function(config.network, trained.config.task)
     if not q_function.fits(trained.params):
         raise ValueError(f"policy {trained.origin} does not fit its network in this version of the package")
-    return Player(
-        policies.make_learned(env, q_function.values)(trained.params),
-        lambda state: q_function.values(trained.params, state.obs, state.scene.target),
-        env,
-        config,
-    )
+    q_values = jax.jit(lambda params, state: q_function.values(params, state.obs, state.scene.target))
+    policy = policies.make_learned(env, q_function.values)(trained.params)
+    return Player(policy, functools.partial(q_values, trained.params), env, config)
 
 
 def run_evaluation(
