@@ -7,7 +7,7 @@ INSTALLED := $(VENV)/.installed
 .PHONY: demo test lint types clean
 
 demo: $(INSTALLED)
-	$(BIN)/python -m pregrasp_jax demo
+	$(BIN)/pregrasp-jax demo
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile

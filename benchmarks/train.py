@@ -1,6 +1,6 @@
 """Where the time of a training goes, stage by stage; prints one JSON object.
 
-    python benchmarks/train.py [--preset cpu] [any option of train.py, for example --network.architecture paper]
+    python benchmarks/train.py [--preset cpu] [any option of `train`, for example --network.architecture paper]
 
 Stages are compiled alone and timed on states and a memory met on the way. `ms_per_env_step` spreads each over the
 pushes it serves: a checkpoint over the steps between two of them, an update over `1 / updates_per_step`.

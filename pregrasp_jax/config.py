@@ -41,7 +41,7 @@ class SceneConfig:
     validation_scenes: int = 50
     """Scenes on which checkpoints are compared during training."""
     test_scenes: int = 200
-    """Scenes of `evaluate.py`, with fixed yaw and target."""
+    """Scenes of `pregrasp-jax evaluate`, with fixed yaw and target."""
     bank_seed: int = 0
     """Seed of the banks; training, validation and test draw from disjoint streams of it."""
 
@@ -220,6 +220,42 @@ class Config:
                 f"{self.scene.max_objects}"
             )
         return self
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskOverrides:
+    """What an evaluation may change of the task that a policy was trained for; null keeps it."""
+
+    workspace: str | None = None
+    """Where: a name in `spaces.workspace.WORKSPACES`."""
+    robot: str | None = None
+    """Who, for scripts: a name in `robot.ROBOTS`. A trained policy knows one robot only."""
+    primitive: str | None = None
+    """Does what, for scripts: a name in `task.registry.KINDS`."""
+    camera: CameraName | None = None
+    """What the policy sees through (`orthographic` for scripts)."""
+    r_out: float | None = None
+    """m, outer radius of the half ring."""
+    obstacles_may_leave: bool = False
+    """True counts failures as the paper does: an obstacle may leave the workspace, and stands beside it then."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig:
+    """One evaluation."""
+
+    policy: str
+    """random, guided, straight, clear, lookahead, pretrained, or a run folder."""
+    assets: AssetsConfig = field(default_factory=AssetsConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    task: TaskOverrides = field(default_factory=TaskOverrides)
+    episodes: int = 100
+    """Test scenes to run, from the first; all policies meet the same."""
+    seed: int = 0
+    """Seed of the policy's own randomness; scenes, yaws and targets are fixed."""
+    num_envs: int = 0
+    """Scenes side by side, 0 chooses; with `native` results do not depend on it."""
 
 
 _RANGES: dict[str, tuple[float, float]] = {

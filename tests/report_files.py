@@ -1,15 +1,13 @@
 """Run folders, evaluations and films as the report finds them."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import yaml
 
-from pregrasp_jax import __main__ as main_module
+from pregrasp_jax.cli.main import main
 from pregrasp_jax.config import PRESETS, to_dict
 from pregrasp_jax.report import Film, Step
 
@@ -70,11 +68,9 @@ def make_films() -> list[Film]:
     return [Film("scene 3, target can", True, steps), Film(f"scene 4, target {HOSTILE}", False, steps)]
 
 
-def run_main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    """Return the exit code of `python -m pregrasp_jax` with these arguments."""
-    monkeypatch.setattr(sys, "argv", ["program", *arguments])
+def run_main(*arguments: str) -> int:
+    """Return the exit code of `pregrasp-jax` with these arguments."""
     try:
-        main_module.main()
+        return main(arguments)
     except SystemExit as error:
         return int(error.code or 0)
-    return 0

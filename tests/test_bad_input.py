@@ -4,7 +4,6 @@ nothing written.
 
 import logging
 import os
-import sys
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,14 @@ import numpy as np
 import pytest
 import trimesh
 from bad_files import make_bad_files
-from scripts import load_script
 
-from pregrasp_jax import __main__ as package
 from pregrasp_jax.assets import decompose, mesh_file, meshes
 from pregrasp_jax.assets.settings import ObjectSettings
+from pregrasp_jax.cli.main import main
 from pregrasp_jax.training import resources, session
 
-PROGRAMS = {"train": load_script("train"), "evaluate": load_script("evaluate"), "pregrasp_jax": package}
+PROGRAMS = {"train": ["train"], "evaluate": ["evaluate"], "pregrasp_jax": []}
+"""Arguments of the program that the first word of a line stands for."""
 
 COMMAND_LINES = [
     ("train", "Expected one of {ci, demo, cpu, paper, resume}"),
@@ -50,7 +49,11 @@ COMMAND_LINES = [
         "evaluate --policy clear --video {w}/v.gif --video-episodes 0",
         "video_episodes = 0 is out of range; allowed is 1",
     ),
-    ("pregrasp_jax dokter", "Unrecognized options: dokter (Available subcommands: assets, compare, demo, doctor"),
+    (
+        "pregrasp_jax dokter",
+        "Unrecognized options: dokter (Available subcommands: assets, compare, demo, doctor, evaluate, ",
+        "scenes, show, train)",
+    ),
     ("pregrasp_jax demo --episodes 0 --run-dir {w}/new", "episodes = 0 is out of range; allowed is 1 and more"),
     ("pregrasp_jax show --pushes -1", "pushes = -1 is out of range; allowed is 0 and more"),
     ("pregrasp_jax scenes --scene.max-objects 9", "scene.max_objects = 9 is out of range; allowed is 2 to 8"),
@@ -64,7 +67,7 @@ PLACES = [
         "train ci --run-dir {w}/file/run",
         "{w}/file/run/config.yaml cannot be written: {w}/file is not a writable folder",
     ),
-    ("train ci --run-dir {w}/run", "{w}/run already holds a run; continue it with `python train.py resume {w}/run`"),
+    ("train ci --run-dir {w}/run", "{w}/run already holds a run; continue it with `pregrasp-jax train resume {w}/run`"),
     ("pregrasp_jax demo --run-dir {w}/full", "run folder {w}/full is not empty and holds no run; allowed is a new"),
     ("train resume {w}/nothing", "{w}/nothing is not a run folder (it has no config.yaml); allowed is the --run-dir"),
     (
@@ -104,7 +107,7 @@ POLICIES = [
     (
         "evaluate --policy {w}/noise",
         "{w}/noise is damaged or not safetensors",
-        "; allowed: pretrained, a run folder of train.py",
+        "; allowed: pretrained, a run folder",
     ),
     (
         "evaluate --policy {w}/foreign.safetensors",
@@ -152,15 +155,18 @@ POLICIES = [
     ),
     ("pregrasp_jax show --policy strait", "policy strait does not exist; allowed: random, guided, straight"),
     ("pregrasp_jax compare {w}/a.json {w}/c.json", "{w}/c.json: No such file or directory; wanted a file written by"),
-    ("pregrasp_jax compare {w}/a.json {w}/noise", "{w}/noise: not JSON; wanted a file written by evaluate.py --json"),
+    (
+        "pregrasp_jax compare {w}/a.json {w}/noise",
+        "{w}/noise: not JSON; wanted a file written by pregrasp-jax evaluate --json",
+    ),
     (
         "pregrasp_jax compare {w}/a.json {w}/list.json",
-        "list.json: not an evaluation; wanted a file written by evaluate",
+        "list.json: not an evaluation; wanted a file written by pregrasp-jax evaluate",
     ),
     (
         "pregrasp_jax compare {w}/header.json {w}/a.json",
         "header.json: damaged evaluation (policy, object_set, camera, physics,",
-        "seed, episodes, success_rate, success_ci95, failures, rows); wanted a file written by evaluate.py --json",
+        "seed, episodes, success_rate, success_ci95, failures, rows); wanted a file written by",
     ),
     ("pregrasp_jax compare {w}/no_rows.json {w}/no_rows.json", "no_rows.json: damaged evaluation (rows); wanted a"),
     ("pregrasp_jax compare {w}/a.json {w}/odd_rows.json", "odd_rows.json: damaged evaluation (rows); wanted a file"),
@@ -169,7 +175,7 @@ POLICIES = [
 ]
 
 DUMPS = [
-    ("pregrasp_jax replay-dump", "Missing from", "PATH file that train.py wrote to RUN_DIR/dumps"),
+    ("pregrasp_jax replay-dump", "Missing from", "PATH file that a training wrote to RUN_DIR/dumps"),
     ("pregrasp_jax replay-dump {w}/others.npz --engine warp", "invalid choice 'warp'", "'native'"),
     ("pregrasp_jax replay-dump {w}/others.npz --png {w}", "{w} is a folder; allowed is the name of a file"),
     (
@@ -290,10 +296,9 @@ def refusal(world, tmp_path, monkeypatch, capsys) -> Any:
 
     def call(command_line: str) -> str:
         program, *arguments = command_line.format(w=world).split()
-        monkeypatch.setattr(sys, "argv", [f"{program}.py", *arguments])
         before = sorted(world.rglob("*"))
         with pytest.raises(SystemExit) as exit_info:
-            PROGRAMS[program].main()
+            main([*PROGRAMS[program], *arguments])
         error = capsys.readouterr().err
         assert exit_info.value.code == 2, error
         assert error.startswith("error: ") and error.count("\n") == 1

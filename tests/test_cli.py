@@ -15,14 +15,15 @@ import trimesh
 from fake_env import fake_env
 from PIL import Image
 from report_files import write_evaluation
-from scripts import load_script
 
 import pregrasp_jax
-from pregrasp_jax import __main__ as main_module
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint import save_policy
 from pregrasp_jax.cli import commands, doctor, film, player, progress
+from pregrasp_jax.cli import evaluate as evaluate_module
 from pregrasp_jax.cli.evaluate import evaluate
+from pregrasp_jax.cli.main import main
+from pregrasp_jax.evaluation.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.config import PRESETS, AssetsConfig, Config, PhysicsConfig, SceneConfig, TaskConfig
 from pregrasp_jax.evaluation.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.learning.networks import QNetwork
@@ -30,18 +31,14 @@ from pregrasp_jax.physics import mjx_version
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.training import program, resources
 
-EVALUATE = load_script("evaluate")
-
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Return a function (main, arguments) -> exit code, standard output, standard error."""
+def run(capsys: pytest.CaptureFixture[str]) -> Any:
+    """Return a function arguments -> exit code, standard output, standard error."""
 
-    def call(main: Any, *arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["program", *arguments])
-        code = 0
+    def call(*arguments: str) -> tuple[int, str, str]:
         try:
-            main()
+            code = main(arguments)
         except SystemExit as error:
             code = int(error.code or 0)
         captured = capsys.readouterr()
@@ -52,15 +49,15 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
 
 @pytest.fixture
 def requests(monkeypatch: pytest.MonkeyPatch) -> list[tuple[EvaluationConfig, dict]]:
-    """Collect what `evaluate.py` asks for, instead of doing it."""
+    """Collect what `evaluate` asks for, instead of doing it."""
     calls: list[tuple[EvaluationConfig, dict]] = []
-    monkeypatch.setattr(EVALUATE, "evaluate", lambda request, **files: calls.append((request, files)))
+    monkeypatch.setattr(evaluate_module, "evaluate", lambda request, **files: calls.append((request, files)))
     return calls
 
 
-def test_evaluate_py_understands_the_documented_line(run: Any, requests: list) -> None:
+def test_evaluate_understands_the_documented_line(run: Any, requests: list) -> None:
     code, _, _ = run(
-        EVALUATE.main,
+        "evaluate",
         *("--policy", "straight", "--object-set", "unseen", "--assets.object-dir", "meshes", "--camera", "pinhole"),
         *("--physics.engine", "native", "--episodes", "30", "--seed", "4", "--json", "a.json", "--video", "v.gif"),
     )
@@ -77,8 +74,8 @@ def test_evaluate_py_understands_the_documented_line(run: Any, requests: list) -
     assert files == {"json_file": Path("a.json"), "video": Path("v.gif"), "video_episodes": 3}
 
 
-def test_evaluate_py_has_a_short_spelling_and_defaults(run: Any, requests: list) -> None:
-    run(EVALUATE.main, "--policy", "runs/a", "--object-dir", "meshes", "--scene.test-scenes", "7")
+def test_evaluate_has_a_short_spelling_and_defaults(run: Any, requests: list) -> None:
+    run("evaluate", "--policy", "runs/a", "--object-dir", "meshes", "--scene.test-scenes", "7")
     request, files = requests[0]
     assert request.assets == AssetsConfig(object_dir="meshes") and request.scene.test_scenes == 7
     assert (request.episodes, request.camera, request.r_out) == (100, None, None)
@@ -110,7 +107,7 @@ def test_a_script_is_evaluated_by_name(fake_world: list[Config], name: str) -> N
     assert json.loads(json.dumps(document, allow_nan=False)) == document
 
 
-def test_evaluate_py_says_that_it_compiles_before_the_first_episode(fake_world: list[Config], capsys: Any) -> None:
+def test_evaluate_says_that_it_compiles_before_the_first_episode(fake_world: list[Config], capsys: Any) -> None:
     evaluate(EvaluationConfig(policy="straight", episodes=2))
     out, err = capsys.readouterr()
     assert out.startswith("straight on 2 seen scenes")
@@ -194,7 +191,7 @@ def test_plain_progress_ends_with_a_line(capsys: pytest.CaptureFixture[str]) -> 
 def test_compare_prints_and_writes(run: Any, tmp_path: Path) -> None:
     a = write_evaluation(tmp_path / "a.json", "mine", [1, 1, 1, 1, 1, 1, 0])
     b = write_evaluation(tmp_path / "b.json", "clear", [0, 0, 0, 0, 0, 0, 1])
-    code, out, _ = run(main_module.main, "compare", str(a), str(b), "--json", str(tmp_path / "c.json"))
+    code, out, _ = run("compare", str(a), str(b), "--json", str(tmp_path / "c.json"))
     assert code == 0
     assert "mine" in out and "only A 6, only B 1" in out and "p = 0.125" in out
     written = json.loads((tmp_path / "c.json").read_text())
@@ -202,7 +199,7 @@ def test_compare_prints_and_writes(run: Any, tmp_path: Path) -> None:
 
 
 def test_doctor_names_what_a_bug_report_needs(run: Any) -> None:
-    code, out, _ = run(main_module.main, "doctor")
+    code, out, _ = run("doctor")
     assert code == 0
     lines = dict(line.split(maxsplit=1) for line in out.splitlines())
     assert {"python", "mujoco", "jax", "cores", "NPROC", "cache", "free"} <= set(lines)
@@ -233,7 +230,7 @@ def test_doctor_outlives_what_it_diagnoses(run: Any, monkeypatch: pytest.MonkeyP
     for owner, name in broken.values():
         monkeypatch.setattr(owner, name, fail)
     monkeypatch.setattr(mjx_version, "installed", lambda: "3.16.0")
-    code, _, _ = run(main_module.main, "doctor")
+    code, _, _ = run("doctor")
     found = dict(doctor.describe())
     assert code == 0 and found["engine native"] == "works"
     assert {found[name] for name in broken} == {"failed (RuntimeError: no backend: none at all)"}
@@ -302,7 +299,7 @@ def test_assets_lists_and_draws_a_folder(run: Any, tmp_path: Path, monkeypatch: 
     trimesh.creation.box((0.06, 0.06, 0.15)).export(meshes / "carton.stl")
     trimesh.creation.box((60.0, 60.0, 150.0)).export(meshes / "millimetres.stl")
     png = tmp_path / "sheet.png"
-    code, out, err = run(main_module.main, "assets", str(meshes), "--png", str(png))
+    code, out, err = run("assets", str(meshes), "--png", str(png))
     assert code == 0, err
     assert "carton" in out and "refused: millimetres.stl" in out
     image = np.asarray(Image.open(png))

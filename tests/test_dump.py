@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,9 @@ import pytest
 from fake_training import PictureEnv, make_config, make_trainer
 from PIL import Image
 
-from pregrasp_jax import __main__ as package
 from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
+from pregrasp_jax.cli.main import main
 from pregrasp_jax.cli.replay import Replay, make_replay, make_replay_env
 from pregrasp_jax.config import Config, ExplorationConfig
 from pregrasp_jax.physics import make_engine
@@ -170,13 +169,12 @@ def test_another_engine_takes_the_scene_up(env, dumps):
         np.testing.assert_allclose(np.asarray(a, float), np.asarray(b, float), atol=1e-6)
 
 
-def run_command(monkeypatch: Any, *arguments: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["pregrasp_jax", "replay-dump", *arguments])
-    package.main()
+def run_command(*arguments: str) -> None:
+    assert main(["replay-dump", *arguments]) == 0
 
 
-def test_the_command_says_what_happened_and_draws_it(dumps, tmp_path, monkeypatch, capsys):
-    run_command(monkeypatch, str(dumps["flung"]), "--png", str(tmp_path / "push.png"))
+def test_the_command_says_what_happened_and_draws_it(dumps, tmp_path, capsys):
+    run_command(str(dumps["flung"]), "--png", str(tmp_path / "push.png"))
     _, *lines, wrote = capsys.readouterr().out.splitlines()
     said = dict(line.split(maxsplit=1) for line in lines)
     assert said["reason"] == "nan; the physics diverged" and said["same"] == "every number as in the training"
@@ -189,8 +187,8 @@ def test_the_command_says_what_happened_and_draws_it(dumps, tmp_path, monkeypatc
 
 
 @pytest.mark.slow
-def test_the_command_pushes_on_mjx_too(dumps, monkeypatch, capsys):
-    run_command(monkeypatch, str(dumps["flung"]), "--engine", "mjx")
+def test_the_command_pushes_on_mjx_too(dumps, capsys):
+    run_command(str(dumps["flung"]), "--engine", "mjx")
     said = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()[1:])
     assert said["reason"] == "nan; the physics diverged"
     assert said["same"] == "not comparable: on mjx, from rounded coordinates"

@@ -24,7 +24,6 @@ ORDER = [
     ["evaluation"],
     ["training"],
     ["report"],
-    ["command_line"],
     ["cli"],
     ["__main__"],
 ]

@@ -1,7 +1,6 @@
 """Pictures of decisions and scenes as the commands write them, of the real environment and built-in objects."""
 
 import dataclasses
-import sys
 import typing
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pregrasp_jax import __main__ as main_module
-from pregrasp_jax import drawing
+from pregrasp_jax import drawing, grid
 from pregrasp_jax.cli import commands, film, player
+from pregrasp_jax.cli.main import main
+from pregrasp_jax.evaluation.player import EvaluationConfig, Player, make_player
 from pregrasp_jax.config import Config, SceneConfig
 from pregrasp_jax.evaluation.player import EvaluationConfig, Player, make_player
 from pregrasp_jax.spaces import grid
@@ -53,9 +53,8 @@ def straight(cached: list[str]) -> Player:
     return make_player(EvaluationConfig(policy="straight"))
 
 
-def _run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["program", *arguments])
-    main_module.main()
+def _run(*arguments: str) -> None:
+    assert main(arguments) == 0
 
 
 def _pixel(xy: np.ndarray) -> np.ndarray:
@@ -72,9 +71,9 @@ def _centroid(image: np.ndarray, color: np.ndarray) -> np.ndarray:
 
 
 def test_show_draws_the_target_where_it_stands_and_the_push_towards_it(
-    targets: np.ndarray, cached: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    targets: np.ndarray, cached: list[str], tmp_path: Path
 ) -> None:
-    _run(monkeypatch, "show", "--policy", "straight", "--scene", "2", "--png", str(tmp_path / "scene.png"))
+    _run("show", "--policy", "straight", "--scene", "2", "--png", str(tmp_path / "scene.png"))
     assert cached == ["kept"]
     panel = np.asarray(Image.open(tmp_path / "scene.png")).astype(float)
     starts = LEFT + 400 + GAP + (MAP + GAP) * np.arange(4)
@@ -111,10 +110,9 @@ def test_scenes_are_drawn_side_by_side(
     targets: np.ndarray,
     cached: list[str],
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    _run(monkeypatch, "scenes", "--png", str(tmp_path / "sheet.png"))
+    _run("scenes", "--png", str(tmp_path / "sheet.png"))
     assert cached == ["kept"]
     out = capsys.readouterr().out
     assert out.startswith("3 test scenes") and out.endswith(f"wrote {tmp_path}/sheet.png\n")

@@ -57,7 +57,7 @@ def test_missing_evaluations_are_named_with_their_command(run_dir: Path) -> None
     lacking = dict(missing(run, load_evaluations(run)))
     assert list(lacking) == ["random on seen objects", "straight on seen objects", "lookahead on seen objects"]
     assert lacking["straight on seen objects"] == (
-        "python evaluate.py --policy straight --object-set seen --episodes 40 --json "
+        "pregrasp-jax evaluate --policy straight --object-set seen --episodes 40 --json "
         f"{run_dir}/evaluations/seen-straight.json"
     )
     page = build_page(run, load_evaluations(run))
@@ -146,17 +146,21 @@ def test_a_line_that_a_crash_cut_is_left_out(run_dir: Path) -> None:
         ("best/evaluation.json", '{"success_rate": 1, "success_ci95": 7}', "evaluation.json: damaged (success_ci95)"),
         ("best/evaluation.json", '{"success_ci95": [0.5, "x"]}', "evaluation.json: damaged (success_ci95)"),
         ("best/evaluation.json", '{"success_rate": "all"}', "evaluation.json: damaged (success_rate)"),
-        ("evaluations/x.json", "{}", "x.json: not an evaluation; wanted a file written by evaluate.py --json"),
+        (
+            "evaluations/x.json",
+            "{}",
+            "x.json: not an evaluation; wanted a file written by pregrasp-jax evaluate --json",
+        ),
         ("evaluations/x.json", '{"format": "pregrasp_jax evaluation 1"}', "x.json: damaged evaluation (policy, object"),
     ],
 )
-def test_what_is_damaged_is_one_line(run_dir: Path, monkeypatch, capsys, file: str, content: str | None, said: str):
+def test_what_is_damaged_is_one_line(run_dir: Path, capsys, file: str, content: str | None, said: str):
     if content is None:
         (run_dir / file).unlink()
     else:
         (run_dir / file).parent.mkdir(exist_ok=True)
         (run_dir / file).write_text(content)
-    assert run_main(monkeypatch, "report", str(run_dir), "--films", "0") == 2
+    assert run_main("report", str(run_dir), "--films", "0") == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and said in error
     assert not (run_dir / "report.html").exists()
@@ -172,7 +176,7 @@ def test_what_is_damaged_is_one_line(run_dir: Path, monkeypatch, capsys, file: s
         ([], "has no policy to play: its first checkpoint is still to come; --films 0 writes the report without"),
     ],
 )
-def test_what_cannot_be_done_is_one_line(run_dir: Path, monkeypatch, capsys, arguments: list[str], said: str) -> None:
-    assert run_main(monkeypatch, "report", str(run_dir), *arguments) == 2
+def test_what_cannot_be_done_is_one_line(run_dir: Path, capsys, arguments: list[str], said: str) -> None:
+    assert run_main("report", str(run_dir), *arguments) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and said in error

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,21 +10,21 @@ import jax
 import numpy as np
 import pytest
 from fake_env import fake_env
+from PIL import Image, ImageSequence
 from report_files import evaluation_row, make_films, run_main, write_evaluation, write_run
-from scripts import load_script
 
 from pregrasp_jax.checkpoint import save_policy
 from pregrasp_jax.cli import demo as demo_module
+from pregrasp_jax.cli import film as film_module
 from pregrasp_jax.cli import player
 from pregrasp_jax.cli import report as report_module
+from pregrasp_jax.cli.main import main
 from pregrasp_jax.cli.report import report, report_session
 from pregrasp_jax.config import PRESETS
 from pregrasp_jax.learning.networks import QNetwork
 
 LONG = [evaluation_row(300, report_module.WORTH_FILMS, 0.75, [0.5, 0.9])]
 """Metrics of a training after which films are made."""
-
-train = load_script("train")
 
 
 @pytest.fixture
@@ -44,7 +43,8 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     monkeypatch.setattr(player, "make_env", lambda config, **_: fake_env(task=config.task))
     # Drawing needs real hulls, which that world has not.
-    monkeypatch.setattr(report_module, "draw_tiles", draw)
+    for module in (report_module, demo_module):
+        monkeypatch.setattr(module, "draw_tiles", draw)
     return players
 
 
@@ -106,19 +106,19 @@ def test_a_run_with_the_name_of_a_script_plays_its_own_policy(run_dir: Path, dra
     assert drawn[0].q_values is not None, "a learned policy has Q-values"
 
 
-def test_a_policy_of_another_network_is_one_line(run_dir: Path, drawn: list[Any], monkeypatch, capsys) -> None:
+def test_a_policy_of_another_network_is_one_line(run_dir: Path, drawn: list[Any], capsys) -> None:
     _save_policy(run_dir, width=0.125)
-    assert run_main(monkeypatch, "report", str(run_dir)) == 2
+    assert run_main("report", str(run_dir)) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and "does not fit its network" in error
 
 
-def test_a_damaged_policy_is_one_line_and_films_0_does_without(run_dir: Path, monkeypatch, capsys) -> None:
+def test_a_damaged_policy_is_one_line_and_films_0_does_without(run_dir: Path, capsys) -> None:
     (run_dir / "best" / "params.safetensors").write_bytes(b"damaged")
-    assert run_main(monkeypatch, "report", str(run_dir)) == 2
+    assert run_main("report", str(run_dir)) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "params.safetensors" in error and "--films 0" in error
-    assert run_main(monkeypatch, "report", str(run_dir), "--films", "0") == 0
+    assert run_main("report", str(run_dir), "--films", "0") == 0
 
 
 def test_an_evaluation_older_than_the_policy_is_called_outdated(run_dir: Path) -> None:
@@ -135,10 +135,10 @@ def test_an_evaluation_older_than_the_policy_is_called_outdated(run_dir: Path) -
     assert "Outdated" not in (run_dir / "report.html").read_text()
 
 
-def test_help_says_where_the_table_comes_from(monkeypatch, capsys) -> None:
-    assert run_main(monkeypatch, "report", "--help") == 0
+def test_help_says_where_the_table_comes_from(capsys) -> None:
+    assert run_main("report", "--help") == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "python evaluate.py --policy NAME --json RUN_DIR/evaluations/NAME.json" in text
+    assert "pregrasp-jax evaluate --policy NAME --json RUN_DIR/evaluations/NAME.json" in text
 
 
 # --- training --------------------------------------------------------------------------------------------------------
@@ -146,12 +146,11 @@ def test_help_says_where_the_table_comes_from(monkeypatch, capsys) -> None:
 
 @pytest.fixture
 def session(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Return a function that runs train.py, whose training ends at once with the given code, and returns its own."""
+    """Return a function that runs `train`, whose training ends at once with the given code, and returns its own."""
 
     def call(code: int) -> int:
         monkeypatch.setattr("pregrasp_jax.training.session.train", lambda *_, **__: code)
-        monkeypatch.setattr(sys, "argv", ["train.py", "ci", "--run-dir", str(run_dir)])
-        return train.main()
+        return main(["train", "ci", "--run-dir", str(run_dir)])
 
     return call
 
@@ -205,11 +204,12 @@ def test_the_demo_leaves_its_evaluations_and_a_report_with_films(
     run_dir: Path, drawn: list, monkeypatch, capsys
 ) -> None:
     _save_policy(run_dir)
-    monkeypatch.setattr(demo_module, "resume", lambda *_: 0)
+    shipped: list[str] = []
+    monkeypatch.setattr(demo_module, "show_shipped", lambda _: shipped.append("shown"))
+    monkeypatch.setattr(demo_module, "resume", lambda *_: shipped.append("trained") or 0)
     # The shipped policy and the other scripts would only compile for longer.
     monkeypatch.setattr(demo_module, "_SCRIPTS", ("clear",))
     monkeypatch.setattr(demo_module, "_SHIPPED", "random")
-    monkeypatch.setattr(demo_module, "film_episodes", lambda *_, **__: None)
     demo_module.demo(run_dir=run_dir, episodes=4)
     files = {file.stem: json.loads(file.read_text()) for file in (run_dir / "evaluations").glob("*.json")}
     assert sorted(files) == ["seen-clear", "seen-random", "seen-run"]
@@ -220,7 +220,27 @@ def test_the_demo_leaves_its_evaluations_and_a_report_with_films(
     assert page.count("<article>") == min(3, successes) + min(3, 4 - successes) and "Outdated" not in page
     assert all(f'scope="row">{name}</th>' in page for name in ("random", "clear"))
     assert "Missing</strong>: straight on seen objects, lookahead on seen objects." in page
-    assert capsys.readouterr().out.splitlines()[-2:] == [
-        f"wrote {run_dir}/report.html: results, learning curves and episodes of the run",
-        f"wrote {run_dir}/demo.gif: random at work",
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == f"wrote {run_dir}/report.html: results, learning curves and episodes of the run"
+    assert shipped == ["shown", "trained"]
+
+
+def test_the_demo_begins_with_the_shipped_policy_at_work(drawn: list[Any], tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(demo_module, "_SHIPPED", "straight")
+    monkeypatch.setattr(demo_module, "resume", lambda *_: 3)
+    with pytest.raises(SystemExit) as exit_info:
+        demo_module.demo(run_dir=tmp_path / "run")
+    assert exit_info.value.code == 3, "the training said so, after the pictures were there"
+    gif, page = tmp_path / "run" / "demo.gif", tmp_path / "run" / "straight.html"
+    assert capsys.readouterr().out.splitlines() == [
+        f"wrote {gif}: straight at work",
+        f"wrote {page}: the same episodes, push by push",
     ]
+    text = page.read_text()
+    with Image.open(gif) as film:
+        # Equal panels, as they are here, become one that is shown longer.
+        shown = sum(frame.info["duration"] for frame in ImageSequence.Iterator(film))
+    assert shown == 1e3 * film_module.SECONDS_PER_FRAME * len(drawn)
+    assert text.count("<article>") == 3 and text.count("<li>") == len(drawn)
+    badges = re.findall(r'<span class="(good|bad)">', text)
+    assert sorted(badges, reverse=True) == badges and {"good", "bad"} == set(badges)

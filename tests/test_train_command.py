@@ -1,4 +1,4 @@
-"""`train.py`: help, how complaints are worded, signals; the real thing killed and resumed (slow)."""
+"""`train`: help, how complaints are worded, signals; the real thing killed and resumed (slow)."""
 
 import json
 import os
@@ -9,27 +9,24 @@ import time
 from pathlib import Path
 
 import pytest
-from scripts import load_script
 
-from pregrasp_jax.command_line import unbox
+from pregrasp_jax.cli.command_line import unbox
+from pregrasp_jax.cli.main import main
 from pregrasp_jax.training.run_folder import EXTENDABLE
 
 ROOT = Path(__file__).parent.parent
-train = load_script("train")
 
 
-def test_help_shows_the_defaults_of_the_preset(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["train.py", "cpu", "--help"])
+def test_help_shows_the_defaults_of_the_preset(capsys):
     with pytest.raises(SystemExit) as exit_info:
-        train.main()
+        main(["train", "cpu", "--help"])
     text = " ".join(capsys.readouterr().out.split())
     assert exit_info.value.code == 0 and "(default: 0.25)" in text and "--replay.hindsight {True,False}" in text
 
 
-def test_help_of_resume_names_all_that_may_change(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["train.py", "resume", "--help"])
+def test_help_of_resume_names_all_that_may_change(capsys):
     with pytest.raises(SystemExit):
-        train.main()
+        main(["train", "resume", "--help"])
     text = capsys.readouterr().out.split("may change")[0]
     assert all(name in text for name in EXTENDABLE)
 

@@ -33,7 +33,7 @@ def load_bank_for(object_dir: str | Path | None, object_set: str, *, progress: P
         raise ValueError(
             f"{object_dir}: {len(bank.names)} usable '{object_set}' objects; allowed are at least {MIN_OBJECTS}. "
             f"{len(refusals)} were refused{first}; "
-            f"`python -m pregrasp_jax assets {object_dir}` lists all"
+            f"`pregrasp-jax assets {object_dir}` lists all"
         )
     for refusal in refusals:
         warnings.warn(f"{object_dir}: {refusal.name} refused: {refusal.reason}", stacklevel=2)

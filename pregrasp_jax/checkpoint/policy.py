@@ -30,7 +30,7 @@ PRETRAINED = Path(__file__).parent.parent / "pretrained"
 """The policy that ships with the package."""
 
 _PARAMS = "params.safetensors"
-_ALLOWED = f"pretrained, a run folder of train.py, or a folder with the {_PARAMS} that it wrote"
+_ALLOWED = f"pretrained, a run folder, or a folder with the {_PARAMS} that it wrote"
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""What the command lines do: `evaluate.py` and `python -m pregrasp_jax`."""
+"""The program `pregrasp-jax`."""

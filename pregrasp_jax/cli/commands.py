@@ -1,4 +1,4 @@
-"""The subcommands of `python -m pregrasp_jax`; their docstrings are the help."""
+"""The subcommands of `pregrasp-jax`; their docstrings are the help."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -13,10 +13,18 @@ from pregrasp_jax.assets.meshes import Refusal, load_object_dir
 from pregrasp_jax.assets.sets import format_table
 from pregrasp_jax.cli import doctor as machine_doctor
 from pregrasp_jax.cli.evaluate import refuse_unwritable
-from pregrasp_jax.config import AssetsConfig, Config, ObjectSet, SceneConfig, TaskConfig
+from pregrasp_jax.config import (
+    AssetsConfig,
+    Config,
+    EvaluationConfig,
+    ObjectSet,
+    SceneConfig,
+    TaskConfig,
+    TaskOverrides,
+)
 from pregrasp_jax.drawing import contact_sheet, save_png
 from pregrasp_jax.evaluation import load_evaluation
-from pregrasp_jax.evaluation.player import EvaluationConfig, make_player
+from pregrasp_jax.evaluation.player import make_player
 from pregrasp_jax.evaluation.statistics import compare as compare_evaluations
 from pregrasp_jax.evaluation.statistics import format_comparison
 from pregrasp_jax.machine import enable_compilation_cache
@@ -56,7 +64,7 @@ def compare(a: Path, b: Path, /, *, json: Path | None = None) -> None:
     """Compare two evaluations on the same scenes: intervals, and McNemar's exact test of their difference.
 
     Args:
-        a: file written by `evaluate.py --json`.
+        a: file written by `pregrasp-jax evaluate --json`.
         b: another, of the same scenes.
         json: write the comparison here.
     """
@@ -111,7 +119,7 @@ def show(
     """Draw one decision: camera view, heightmaps, Q maps of a learned policy, and the push it chooses.
 
     Args:
-        policy: who decides; a name or run folder as in `evaluate.py`.
+        policy: who decides; a name or run folder as in `pregrasp-jax evaluate`.
         scene: test scene.
         pushes: let the policy push so often before the picture is taken.
         object_dir: folder of meshes; the built-in catalogue if left out.
@@ -124,7 +132,8 @@ def show(
         raise ValueError(f"pushes = {pushes} is out of range; allowed is 0 and more")
     enable_compilation_cache()
     assets_config = AssetsConfig(object_dir=object_dir, object_set=object_set)
-    player = make_player(EvaluationConfig(policy=policy, assets=assets_config, camera=camera))
+    task = TaskOverrides(camera=camera)
+    player = make_player(EvaluationConfig(policy=policy, assets=assets_config, task=task))
     if not 0 <= scene < len(player.env.scenes):
         raise ValueError(f"scene = {scene} is out of range; allowed is 0 to {len(player.env.scenes) - 1}")
     _write_png(png, draw_decision(player, scene=scene, pushes=pushes))

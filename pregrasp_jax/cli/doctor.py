@@ -1,4 +1,4 @@
-"""`python -m pregrasp_jax doctor`: what this machine offers, in lines a bug report can carry."""
+"""`pregrasp-jax doctor`: what this machine offers, in lines a bug report can carry."""
 
 import contextlib
 import importlib.util

@@ -1,18 +1,50 @@
-"""The command `evaluate.py`: run, print the table, write the JSON and the film."""
+"""`pregrasp-jax evaluate`: run a policy by the paper's protocol, print the table, write the JSON and the film."""
 
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from pregrasp_jax import io
-from pregrasp_jax.cli.progress import EpisodeProgress
-from pregrasp_jax.evaluation import format_evaluation
-from pregrasp_jax.evaluation.player import EvaluationConfig, make_player, run_evaluation
-from pregrasp_jax.report.play import film_episodes
+from pregrasp_jax.config import EvaluationConfig
+
+ALIASES = {
+    "--object-dir": "--assets.object-dir",
+    "--object-set": "--assets.object-set",
+    "--camera": "--task.camera",
+    "--r-out": "--task.r-out",
+    "--obstacles-may-leave": "--task.obstacles-may-leave",
+}
+"""Short names of options."""
+
+
+def evaluate_options(
+    request: Annotated[EvaluationConfig, tyro.conf.arg(name="")],
+    json: Path | None = None,
+    video: Path | None = None,
+    video_episodes: int = 3,
+) -> None:
+    """Evaluate a policy by the paper's protocol: fixed test scenes, at most ten pushes, one grasp.
+
+    Prints a table, and writes a JSON file and a film where asked for:
+    `pregrasp-jax evaluate --policy runs/NAME --object-set seen --episodes 100 --json result.json`
+
+    The options are named as those of `train`. Short names: --object-dir, --object-set, --camera, --r-out,
+    --obstacles-may-leave.
+
+    Args:
+        request: What to evaluate.
+        json: Write the result here; `pregrasp-jax compare A.json B.json` pairs two of them.
+        video: Write a film of some episodes here.
+        video_episodes: Episodes in the film, from the first scene.
+    """
+    evaluate(request, json_file=json, video=video, video_episodes=video_episodes)
 
 
 def evaluate(
     request: EvaluationConfig, *, json_file: Path | None = None, video: Path | None = None, video_episodes: int = 3
 ) -> None:
-    """Evaluate a policy; see `evaluate.py --help`.
+    """Evaluate a policy; see `pregrasp-jax evaluate --help`.
 
     Args:
         request: what to evaluate.
@@ -23,6 +55,11 @@ def evaluate(
     Raises:
         ValueError: something of the request cannot be used, or a file could not be written afterwards.
     """
+    from pregrasp_jax.cli.progress import EpisodeProgress
+    from pregrasp_jax.evaluation import format_evaluation
+    from pregrasp_jax.evaluation.player import make_player, run_evaluation
+    from pregrasp_jax.report.play import film_episodes
+
     for path in (json_file, video):
         refuse_unwritable(path)
     if video and not 1 <= video_episodes <= request.episodes:

@@ -1,4 +1,4 @@
-"""`python -m pregrasp_jax replay-dump`: repeat a push on which the physics of a training diverged."""
+"""`pregrasp-jax replay-dump`: repeat a push on which the physics of a training diverged."""
 
 import dataclasses
 from collections.abc import Callable
@@ -55,7 +55,7 @@ def replay_dump(
     """Repeat a push on which the physics of a training diverged, and say what happens.
 
     Args:
-        dump: file that train.py wrote to RUN_DIR/dumps.
+        dump: file that a training wrote to RUN_DIR/dumps.
         engine: push on this engine; the one of the training if left out.
         object_dir: where the meshes of the training lie now; where they lay then if left out.
         png: draw the scene before and after the push here.
@@ -196,7 +196,7 @@ def _one_scene(dump: Dump) -> SceneBank:
     try:
         ids, poses, target = (dump.arrays[f"state/scene/{name}"][None] for name in names)
     except KeyError as error:
-        raise ValueError(f"{dump.path}: {error.args[0]} is missing; wanted is a file that train.py wrote") from None
+        raise ValueError(f"{dump.path}: {error.args[0]} is missing; wanted is a file of RUN_DIR/dumps") from None
     zero = np.zeros(1)
     return SceneBank(
         object_ids=ids,

@@ -1,4 +1,4 @@
-"""`python -m pregrasp_jax report`: the page of a run, with episodes that its policy plays now."""
+"""`pregrasp-jax report`: the page of a run, with episodes that its policy plays now."""
 
 import sys
 from collections import Counter
@@ -8,16 +8,17 @@ from pathlib import Path
 from pregrasp_jax.checkpoint import Policy, checksum, load_policy
 from pregrasp_jax.checkpoint.state import exists
 from pregrasp_jax.cli.evaluate import refuse_unwritable
-from pregrasp_jax.config import AssetsConfig
+from pregrasp_jax.config import AssetsConfig, EvaluationConfig
 from pregrasp_jax.evaluation import load_evaluation
-from pregrasp_jax.evaluation.player import EvaluationConfig, Player, make_player
+from pregrasp_jax.evaluation.player import Player, make_player
 from pregrasp_jax.evaluation.runner import Decision
 from pregrasp_jax.machine import enable_compilation_cache
 from pregrasp_jax.report import Film, RunRecord, Step, load_evaluations, read_run, write_report
 from pregrasp_jax.report.page import REPORT, kept_episodes
-from pregrasp_jax.report.play import describe_decision, draw_tiles, make_play
+from pregrasp_jax.report.play import Tiles, describe_decision, draw_tiles, make_play
 from pregrasp_jax.report.record import SECONDS
 from pregrasp_jax.report.results import evaluation_files, is_of_run
+from pregrasp_jax.task.env import Env
 
 FILMS, MOST_SCENES = 3, 30
 """Successes and failures to show, and scenes that are played to find them."""
@@ -39,13 +40,14 @@ def report(
 ) -> None:
     """Write the report of a run: results, learning curves, episodes in pictures, failures, time, configuration.
 
-    The result table holds the evaluations in RUN_DIR/evaluations. Each is put there by a line like `python evaluate.py
-    --policy NAME --json RUN_DIR/evaluations/NAME.json`, NAME being random, straight, clear or lookahead, and
-    `--policy RUN_DIR --json RUN_DIR/evaluations/run.json` for the run itself; the page lists the lines that it lacks.
+    The result table holds the evaluations in RUN_DIR/evaluations. Each is put there by a line like
+    `pregrasp-jax evaluate --policy NAME --json RUN_DIR/evaluations/NAME.json`, NAME being random, straight, clear or
+    lookahead, and `--policy RUN_DIR --json RUN_DIR/evaluations/run.json` for the run itself; the page lists the
+    lines that it lacks.
 
     Args:
-        run_dir: run folder of train.py; it may still be in training.
-        evaluations: files written by `evaluate.py --json`; those in RUN_DIR/evaluations if left out.
+        run_dir: run folder; it may still be in training.
+        evaluations: files written by `pregrasp-jax evaluate --json`; those in RUN_DIR/evaluations if left out.
         films: successes and failures to show, so many of each; 0 keeps those that the page has of the same policy.
         scenes: test scenes to play at the most while looking for them.
         html: where the page goes; report.html in the run folder if left out.
@@ -197,8 +199,12 @@ def describe_films(films: Sequence[Film], counts: Counter[bool], played: str) ->
 
 def draw_film(player: Player, decisions: list[Decision]) -> Film:
     """Draw one episode, its end included."""
-    scene, target, ending = describe_decision(player.env, decisions[-1])
-    steps = [
-        Step(describe_decision(player.env, decision)[-1], tuple(draw_tiles(player, decision))) for decision in decisions
-    ]
-    return Film(f"{scene}, {target}: {ending}", decisions[-1].success, tuple(steps))
+    return make_film(player.env, [(decision, draw_tiles(player, decision)) for decision in decisions])
+
+
+def make_film(env: Env, drawn: Sequence[tuple[Decision, Tiles]]) -> Film:
+    """Return one episode of which every decision, and the end, is drawn."""
+    last = drawn[-1][0]
+    scene, target, ending = describe_decision(env, last)
+    steps = [Step(describe_decision(env, decision)[-1], tuple(tiles)) for decision, tiles in drawn]
+    return Film(f"{scene}, {target}: {ending}", last.success, tuple(steps))

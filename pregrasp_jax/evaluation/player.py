@@ -1,16 +1,17 @@
-"""What `evaluate.py` does: find the policy, make the environment it belongs to, run it, describe the result."""
+"""An evaluation: find the policy, make the environment it belongs to, run it, describe the result."""
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
 
 from pregrasp_jax.checkpoint import load_policy
-from pregrasp_jax.config import AssetsConfig, CameraName, Config, PhysicsConfig, SceneConfig
+from pregrasp_jax.config import Config, EvaluationConfig, TaskOverrides
 from pregrasp_jax.evaluation import Evaluator, Progress, evaluation_document
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.machine import announced_compilation, enable_compilation_cache
@@ -27,35 +28,6 @@ LOOKAHEAD_NUM_ENVS = 4
 
 _PACKING = 50
 """Scenes between two lines that say how many are packed."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluationConfig:
-    """One evaluation.
-
-    Attributes:
-        policy: name of a script, `pretrained`, or a folder that `checkpoint.load_policy` reads.
-        assets: objects.
-        scene: test scenes; the defaults are the scenes that published results refer to.
-        physics: engine.
-        camera: None takes the one the policy was trained with (`orthographic` for scripts).
-        r_out: m, outer radius of the half ring; None takes the one the policy was trained with.
-        obstacles_may_leave: count as the paper does: only the target fails by leaving the workspace.
-        episodes: test scenes to run, from the first.
-        seed: of the policy's own randomness.
-        num_envs: scenes side by side; 0 chooses. With `native` results do not depend on it.
-    """
-
-    policy: str
-    assets: AssetsConfig = field(default_factory=AssetsConfig)
-    scene: SceneConfig = field(default_factory=SceneConfig)
-    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
-    camera: CameraName | None = None
-    r_out: float | None = None
-    obstacles_may_leave: bool = False
-    episodes: int = 100
-    seed: int = 0
-    num_envs: int = 0
 
 
 @dataclass(frozen=True)
@@ -90,6 +62,8 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     """
     trained = _load(request.policy)
     config = _environment_config(request, Config() if trained is None else trained.config)
+    if trained is not None:
+        _refuse_other_hand(config, trained.config)
     if trained is not None and trained.config.assets.object_dir != request.assets.object_dir:
         folders = (trained.config.assets.object_dir, request.assets.object_dir)
         say("note: trained on {}, evaluated on {}".format(*(folder or "the built-in objects" for folder in folders)))
@@ -105,12 +79,9 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     q_function = make_q_function(config.network, trained.config.task, env.primitive.actions)
     if not q_function.fits(trained.params):
         raise ValueError(f"policy {trained.origin} does not fit its network in this version of the package")
-    return Player(
-        make_learned(env, q_function.values)(trained.params),
-        lambda state: q_function.values(trained.params, state.obs, state.scene.target),
-        env,
-        config,
-    )
+    q_values = jax.jit(lambda params, state: q_function.values(params, state.obs, state.scene.target))
+    policy = make_learned(env, q_function.values)(trained.params)
+    return Player(policy, functools.partial(q_values, trained.params), env, config)
 
 
 def run_evaluation(
@@ -156,7 +127,7 @@ def _load(spec: str) -> Any:
     if spec == "pretrained" or Path(spec).exists():
         return load_policy(spec)
     names = ", ".join([*scripts.SCRIPTS, "pretrained"])
-    raise ValueError(f"policy {spec} does not exist; allowed: {names}, or a run folder of train.py")
+    raise ValueError(f"policy {spec} does not exist; allowed: {names}, or a run folder")
 
 
 def _environment_config(request: EvaluationConfig, trained: Config) -> Config:
@@ -165,10 +136,10 @@ def _environment_config(request: EvaluationConfig, trained: Config) -> Config:
         raise ValueError(f"num_envs = {request.num_envs} is out of range; allowed is 1 and more, or 0 to let it choose")
     if request.episodes < 1:
         raise ValueError(f"episodes = {request.episodes} is out of range; allowed is 1 and more")
-    if trained.network.architecture == "compact" and (request.r_out or 0.0) > trained.task.r_out:
+    if trained.network.architecture == "compact" and (request.task.r_out or 0.0) > trained.task.r_out:
         raise ValueError(
-            f"r_out = {request.r_out} is out of range; allowed for this policy, whose network values no longer pushes, "
-            f"is {trained.task.r_in} to {trained.task.r_out}"
+            f"task.r_out = {request.task.r_out} is out of range; allowed for this policy, whose network values no "
+            f"longer pushes, is {trained.task.r_in} to {trained.task.r_out}"
         )
     test_scenes = max(request.scene.test_scenes, request.episodes)
     config = dataclasses.replace(
@@ -177,14 +148,24 @@ def _environment_config(request: EvaluationConfig, trained: Config) -> Config:
         assets=request.assets,
         scene=dataclasses.replace(request.scene, test_scenes=test_scenes),
         physics=request.physics,
-        task=dataclasses.replace(
-            trained.task,
-            camera=request.camera or trained.task.camera,
-            r_out=trained.task.r_out if request.r_out is None else request.r_out,
-            obstacles_may_leave=request.obstacles_may_leave,
-        ),
+        task=dataclasses.replace(trained.task, **_given(request.task)),
     )
     return config.validate()
+
+
+def _refuse_other_hand(config: Config, trained: Config) -> None:
+    """Refuse a robot or a primitive that a policy was not trained with."""
+    for name in ("robot", "primitive"):
+        asked, known = getattr(config.task, name), getattr(trained.task, name)
+        if asked != known:
+            raise ValueError(
+                f"task.{name} = {asked!r}: the policy was trained with {known!r}, which is what is allowed"
+            )
+
+
+def _given(overrides: TaskOverrides) -> dict[str, Any]:
+    """Return what is to be changed."""
+    return {name: value for name, value in dataclasses.asdict(overrides).items() if value is not None}
 
 
 def _make_script(name: str, env: Env, config: Config) -> Policy:

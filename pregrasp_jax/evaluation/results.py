@@ -18,7 +18,7 @@ FORMAT = "pregrasp_jax evaluation 1"
 
 _TEXTS = ("policy", "object_set", "camera", "physics", "hull_bank_hash", "scene_bank_hash")
 
-_WANTED = "wanted a file written by evaluate.py --json"
+_WANTED = "wanted a file written by pregrasp-jax evaluate --json"
 
 GRASP_FAILED = "grasp_failed"
 """Reason of an episode whose target was in the closing region but not held; the others are `REASONS`."""
@@ -115,7 +115,7 @@ def evaluation_document(
     scene_bank_hash: str,
     wall_seconds: float,
 ) -> dict[str, Any]:
-    """Return the content of an evaluation file (`evaluate.py --json`).
+    """Return the content of an evaluation file (`pregrasp-jax evaluate --json`).
 
     Args:
         result: what was measured.
@@ -152,7 +152,7 @@ def load_evaluation(path: Path) -> dict[str, Any]:
     """Read an evaluation file that has all that comparisons and reports show.
 
     Raises:
-        ValueError: missing, damaged, not JSON, or not written by `evaluate.py --json`.
+        ValueError: missing, damaged, not JSON, or not written by `pregrasp-jax evaluate --json`.
     """
     try:
         document = json.loads(path.read_text())
@@ -190,7 +190,7 @@ def _is_row(row: Any) -> bool:
 
 
 def format_evaluation(document: dict[str, Any]) -> str:
-    """Return the table that `evaluate.py` prints."""
+    """Return the table that `pregrasp-jax evaluate` prints."""
     low, high = document["success_ci95"]
     title = f"{document['policy']} on {document['episodes']} {document['object_set']} scenes"
     lines = {

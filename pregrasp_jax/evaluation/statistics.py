@@ -136,7 +136,7 @@ class Comparison:
 
 
 def compare(a: Mapping[str, Any], b: Mapping[str, Any]) -> Comparison:
-    """Pair two evaluations (the JSON of `evaluate.py`) by scene and test their difference.
+    """Pair two evaluations (the JSON of `pregrasp-jax evaluate`) by scene and test their difference.
 
     Raises:
         ValueError: the two did not run the same scenes with the same targets; one line names what differs.
@@ -201,7 +201,7 @@ def _differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
 
 
 def format_comparison(comparison: Comparison) -> str:
-    """Return the lines that `python -m pregrasp_jax compare` prints."""
+    """Return the lines that `pregrasp-jax compare` prints."""
     lines = [f"{comparison.episodes} scenes, paired"]
     for letter, name, rate, (low, high) in zip(
         "AB", comparison.policies, comparison.success_rates, comparison.success_ci95, strict=True

@@ -198,7 +198,7 @@ SCRIPTS: dict[str, Callable[[Env], Policy]] = {
     "clear": make_clear,
     "lookahead": make_lookahead,
 }
-"""Policies that need no training, by the name `evaluate.py --policy` knows them by."""
+"""Policies that need no training, by the name `pregrasp-jax evaluate --policy` knows them by."""
 
 
 def nearest_action(mask: jax.Array, point: jax.Array, choice: jax.Array, actions: ActionSpace) -> jax.Array:

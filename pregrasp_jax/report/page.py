@@ -4,7 +4,7 @@ import datetime
 import importlib.resources
 import re
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -77,16 +77,6 @@ def build_page(
     run: RunRecord, documents: Sequence[dict[str, Any]], episodes: str = "", *, outdated: Sequence[str] = ()
 ) -> str:
     """Return the page; see `write_report`. Without `episodes` it says how to get them."""
-    style = importlib.resources.files("pregrasp_jax.report").joinpath("style.css").read_text()
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", http_equiv="Content-Security-Policy", content=_POLICY),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("meta", name="color-scheme", content="light dark"),
-        element("title", f"{run.name}: report of a run"),
-        element("style", Markup(style)),
-    )
     sections = [
         _section("Results", *_results(run, documents), *_outdated(outdated)),
         _section("Learning curves", *_learning(run)),
@@ -95,7 +85,35 @@ def build_page(
         _section("Where the time went", *_figures(charts.time_figures(run))),
         _section("Configuration and versions", *_settings(run)),
     ]
-    body = element("body", element("header", *_header(run)), element("main", *sections))
+    return _page(f"{run.name}: report of a run", _header(run), sections)
+
+
+def write_films(path: Path, films: Sequence[Film], *, title: str, text: str, note: str) -> None:
+    """Write a page that shows nothing but episodes, whole or not at all.
+
+    Args:
+        path: of the page.
+        films: the episodes.
+        title: heading.
+        text: the sentence below it.
+        note: which episodes these are.
+    """
+    header = [element("h1", title), element("p", text, class_="soft")]
+    io.write_bytes(path, _page(title, header, [_episodes(films, note)]).encode())
+
+
+def _page(title: str, header: Iterable[Markup], sections: Iterable[str]) -> str:
+    style = importlib.resources.files("pregrasp_jax.report").joinpath("style.css").read_text()
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", http_equiv="Content-Security-Policy", content=_POLICY),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("meta", name="color-scheme", content="light dark"),
+        element("title", title),
+        element("style", Markup(style)),
+    )
+    body = element("body", element("header", *header), element("main", *sections))
     return "<!DOCTYPE html>\n" + element("html", head, body, lang="en") + "\n"
 
 
@@ -168,18 +186,18 @@ def _outdated(files: Sequence[str]) -> Iterator[Markup]:
     if files:
         text = (
             f": {', '.join(files)} is older than the run's policy. What is said of this run from there is true of an "
-            "earlier policy; the same line of evaluate.py measures it anew."
+            "earlier policy; the same command measures it anew."
         )
         yield element("p", element("strong", "Outdated"), text)
 
 
 def _how_to_film(run: RunRecord) -> Iterator[Markup]:
     yield element("p", "No episodes of this policy were played. This command plays some and writes the page anew:")
-    yield element("pre", code(f"python -m pregrasp_jax report {shlex.quote(str(run.path))}"))
+    yield element("pre", code(f"pregrasp-jax report {shlex.quote(str(run.path))}"))
 
 
-def _episodes(films: Sequence[Film], note: str, policy: str) -> Markup:
-    """Return the section of films, marked with the policy that they are of."""
+def _episodes(films: Sequence[Film], note: str, policy: str | None = None) -> Markup:
+    """Return the section of films, marked with the policy that they are of if a later page may keep it."""
     ramps = [
         element("span", class_=f"ramp {name}", role="img", aria_label="dark to bright") for name in ("height", "q")
     ]

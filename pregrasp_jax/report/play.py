@@ -24,6 +24,9 @@ SECONDS_PER_FRAME = 1.5
 
 _COLUMNS, _TILE = 4, (240, 320)
 
+Tiles = list[tuple[str, np.ndarray]]
+"""Pictures of one decision, each with its caption."""
+
 
 def film_episodes(path: Path, player: Player, *, episodes: int, seed: int) -> None:
     """Write the first scenes as a GIF with one panel per decision, the same episodes as an evaluation's."""
@@ -74,10 +77,15 @@ def in_batch(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def draw_panel(player: Player, decision: Decision) -> np.ndarray:
     """Return scene | height | segmentation | one Q map per choice, with what is allowed and the chosen push."""
-    return drawing.make_panel(draw_tiles(player, decision), title=" | ".join(describe_decision(player.env, decision)))
+    return make_panel(player.env, decision, draw_tiles(player, decision))
 
 
-def draw_tiles(player: Player, decision: Decision) -> list[tuple[str, np.ndarray]]:
+def make_panel(env: Env, decision: Decision, tiles: Tiles) -> np.ndarray:
+    """Return the pictures of a decision side by side under a title."""
+    return drawing.make_panel(tiles, title=" | ".join(describe_decision(env, decision)))
+
+
+def draw_tiles(player: Player, decision: Decision) -> Tiles:
     """Return the pictures of `draw_panel`, each with its caption."""
     env, state = player.env, decision.state
     return drawing.make_tiles(

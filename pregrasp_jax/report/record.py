@@ -61,7 +61,7 @@ def read_run(path: Path) -> RunRecord:
     """
     config_file = path / "config.yaml"
     if not config_file.is_file():
-        raise ValueError(f"{path} is not a run folder (it has no config.yaml); wanted the --run-dir of train.py")
+        raise ValueError(f"{path} is not a run folder (it has no config.yaml); wanted the --run-dir of a training")
     try:
         config = yaml.safe_load(config_file.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:

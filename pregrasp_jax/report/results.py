@@ -46,7 +46,7 @@ def load_evaluations(run: RunRecord, files: Sequence[Path] = ()) -> list[dict[st
         The documents by object set, in each the run first, then the scripts, then others.
 
     Raises:
-        ValueError: one is missing, damaged, or not written by `evaluate.py --json`.
+        ValueError: one is missing, damaged, or not written by `pregrasp-jax evaluate --json`.
     """
     documents = [load_evaluation(file) for file in files or evaluation_files(run)]
     return sorted(documents, key=lambda document: (document["object_set"], _rank(run, document)))
@@ -102,7 +102,7 @@ def _command(run: RunRecord, policy: str, object_set: str, episodes: int) -> str
     radius = run.setting("task", "r_out", Config().task.r_out)
     if policy in BASELINES and radius != TaskConfig().r_out:
         arguments += ["--r-out", str(radius)]
-    return shlex.join(["python", "evaluate.py", *arguments, "--json", str(run.path / EVALUATIONS / f"{name}.json")])
+    return shlex.join(["pregrasp-jax", "evaluate", *arguments, "--json", str(run.path / EVALUATIONS / f"{name}.json")])
 
 
 def _row(run: RunRecord, document: dict[str, Any], of_this_run: Sequence[dict[str, Any]]) -> Markup:

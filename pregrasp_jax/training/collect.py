@@ -31,7 +31,7 @@ RECENT_EPISODES = 200
 
 
 class Environment(Protocol):
-    """What training asks of `pregrasp_jax.env.Env`."""
+    """What training asks of `pregrasp_jax.task.env.Env`."""
 
     @property
     def engine(self) -> Engine:

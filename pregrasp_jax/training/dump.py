@@ -36,7 +36,7 @@ MAX_DUMPS = 20
 COORDINATES = ("qpos", "qvel")
 """Arrays beside those of the mishap."""
 
-_WANTED = "wanted is a file of RUN_DIR/dumps that train.py wrote"
+_WANTED = "wanted is a file of RUN_DIR/dumps that a training wrote"
 
 DumpFn = Callable[[Path, Mishap], Path | None]
 """``(folder, mishap) -> path`` of the file that was written; None if the folder is full."""

@@ -1,4 +1,4 @@
-"""Several processes, one per host, that train as one (`train.py --distributed True`).
+"""Several processes, one per host, that train as one (`pregrasp-jax train --distributed True`).
 
 All run the same program on the same numbers, each on its own devices. Process 0 alone writes and speaks, and it
 decides what depends on a clock, a signal or a disk: these differ between hosts, and a process that turned another way

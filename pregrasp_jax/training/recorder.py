@@ -142,7 +142,7 @@ class Recorder:
             if path := self.dump_fn(self.folder.dumps, mishap):
                 self.console.say(
                     f"the physics diverged at step {int(mishap.env_steps)} in scene {int(mishap.scene)}; "
-                    f"`python -m pregrasp_jax replay-dump {path}` repeats the push"
+                    f"`pregrasp-jax replay-dump {path}` repeats the push"
                 )
 
         self._write("dump", write)

@@ -208,7 +208,7 @@ def refuse_used(path: Path) -> None:
         raise ValueError(f"run folder {path} is a file; allowed is a new or empty folder")
     if (path / "config.yaml").exists():
         raise ValueError(
-            f"run folder {path} already holds a run; continue it with `python train.py resume {path}`, or choose "
+            f"run folder {path} already holds a run; continue it with `pregrasp-jax train resume {path}`, or choose "
             "another --run-dir"
         )
     if path.exists() and any(entry.name != "run.lock" for entry in path.iterdir()):

@@ -79,7 +79,7 @@ class Trainer:
         self.recorder.dump(self.state)
         self.recorder.save(self.state)
         step, path = self.recorder.counters.env_steps, self.recorder.folder.path
-        return f"interrupted at step {step}; continue with `python train.py resume {path}`"
+        return f"interrupted at step {step}; continue with `pregrasp-jax train resume {path}`"
 
     def step(self, program: Program) -> None:
         """Push in every scene and learn from it: once, or as often as a compiled program does without the host."""

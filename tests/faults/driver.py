@@ -1,6 +1,6 @@
-"""The process of `train.py` in the world without physics, in which something happens at a chosen moment.
+"""The process of `pregrasp-jax train` in the world without physics, in which something happens at a chosen moment.
 
-    python driver.py {kill,wait} MOMENT COUNT ARGUMENTS_OF_TRAIN_PY
+    python driver.py {kill,wait} MOMENT COUNT ARGUMENTS_OF_TRAIN
 
 MOMENT is `collect`, `update`, or how the name of a file ends; COUNT says which call or which such file. A file is
 half written when the process kills itself or waits for a line on standard input; a computation is under way.
@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import fake_training
-from scripts import load_script
 
 from pregrasp_jax import io
+from pregrasp_jax.cli import main as program
 from pregrasp_jax.training import session
 from pregrasp_jax.training.program import Program
 
@@ -85,8 +85,7 @@ def main() -> int:
     world.make_env = lambda config, **_: fake_training.PictureEnv()
     world.make_program = lambda env, config, **_: fake_training.make_program(config, env)
     world.make_evaluate = lambda env, config: (fake_training.evaluate, lambda params: None)
-    sys.argv = ["train.py", *arguments]
-    return load_script("train").main()
+    return program.main(["train", *arguments])
 
 
 if __name__ == "__main__":

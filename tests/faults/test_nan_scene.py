@@ -119,7 +119,7 @@ def test_a_run_writes_no_more_than_so_many_dumps(tmp_path, monkeypatch):
     names = sorted(path.name for path in trainer.folder.dumps.iterdir())
     assert names == ["step-000003-scene-1.npz", "step-000006-scene-1.npz"]
     assert said == [
-        f"the physics diverged at step {step} in scene 1; `python -m pregrasp_jax replay-dump "
+        f"the physics diverged at step {step} in scene 1; `pregrasp-jax replay-dump "
         f"{trainer.folder.dumps / name}` repeats the push"
         for step, name in zip((3, 6), names, strict=True)
     ]

@@ -113,7 +113,7 @@ def test_sigterm_ends_with_a_checkpoint_and_says_how_to_go_on(tmp_path, whole):
         process.send_signal(signal.SIGTERM)
         output, error = process.communicate("go on\n", timeout=300)
     assert process.returncode == 128 + signal.SIGTERM and error == ""
-    ending = f"interrupted at step {4 * STEP}; continue with `python train.py resume {path}`"
+    ending = f"interrupted at step {4 * STEP}; continue with `pregrasp-jax train resume {path}`"
     assert output.splitlines() == [STOPPING, ending]
     trainer, said = go_on(path)
     assert said[0].startswith(f"resuming {path} at step {4 * STEP}, episode ")

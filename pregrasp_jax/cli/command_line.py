@@ -9,8 +9,8 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-USAGE_ERROR = 2
-"""Exit code of a command that was asked for something impossible."""
+USAGE_ERROR, INTERRUPTED = 2, 130
+"""Exit codes of a command that was asked for something impossible, and of one that Ctrl-C has ended."""
 
 
 def parse(parser: Callable[[], T]) -> T:
@@ -37,7 +37,8 @@ def unbox(text: str) -> str:
     lines = [line.strip("│╭╮╰╯─ ") for line in text.splitlines()]
     sections = _sections([line if line.strip("-") else "" for line in lines])
     message = " ".join(sections[0]) if sections else "the arguments cannot be read"
-    offers = [line for section in sections[1:] for line in section if re.match(r"--[a-z]|Available", line)]
+    offers = [" ".join(lines) for lines in sections[1:] if lines[0].startswith("Available")]
+    offers += [line for section in sections[1:] for line in section if re.match(r"--[a-z]", line)]
     return f"{message} ({offers[0]})" if offers and "nrecognized" in message else message
 
 
