@@ -129,7 +129,7 @@ class RunFolder:
             if then.get(name) != hashes.get(name):
                 raise ValueError(
                     f"run {self.path} began with another {name} ({then.get(name)}, now {hashes.get(name)}); resume it "
-                    "with the same objects, MuJoCo and package version"
+                    "with the same objects, MuJoCo and package version; --init-from starts a new run from its parameters"
                 )
         if difference(stored_config(self.path), config):
             write_config(self.path / "config.yaml", config)
