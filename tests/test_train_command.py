@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from scripts import load_script
 
+from pregrasp_jax.checkpoint.run_config import CHANGEABLE
 from pregrasp_jax.command_line import unbox
-from pregrasp_jax.training.run_folder import EXTENDABLE
 
 ROOT = Path(__file__).parent.parent
 train = load_script("train")
@@ -31,7 +31,7 @@ def test_help_of_resume_names_all_that_may_change(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         train.main()
     text = capsys.readouterr().out.split("may change")[0]
-    assert all(name in text for name in EXTENDABLE)
+    assert all(name in text for name in CHANGEABLE)
 
 
 BOX = """

@@ -11,7 +11,7 @@ import jax
 
 from pregrasp_jax import policies
 from pregrasp_jax.checkpoint import load_policy
-from pregrasp_jax.config import AssetsConfig, Camera, Config, PhysicsConfig, SceneConfig
+from pregrasp_jax.config import AssetsConfig, Camera, Config, PhysicsConfig, SceneConfig, with_absolute_paths
 from pregrasp_jax.env import Env, make_env, with_task
 from pregrasp_jax.evaluation import Evaluator, Progress, evaluation_document
 from pregrasp_jax.learning.q_function import make_q_function
@@ -90,9 +90,11 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     """
     trained = _load(request.policy)
     config = _environment_config(request, Config() if trained is None else trained.config)
-    if trained is not None and trained.config.assets.object_dir != request.assets.object_dir:
-        folders = (trained.config.assets.object_dir, request.assets.object_dir)
-        say("note: trained on {}, evaluated on {}".format(*(folder or "the built-in objects" for folder in folders)))
+    if trained is not None:
+        folders = [with_absolute_paths(made).assets.object_dir for made in (trained.config, config)]
+        if folders[0] != folders[1]:
+            names = (folder or "the built-in objects" for folder in folders)
+            say("note: trained on {}, evaluated on {}".format(*names))
 
     def packed(done: int, total: int) -> None:
         if done == total or done % _PACKING < 16:
