@@ -50,9 +50,9 @@ class Arguments:
     json: Path | None = None
     """Write the result here; `python -m pregrasp_jax compare A.json B.json` pairs two of them."""
     video: Path | None = None
-    """Write a GIF of some episodes here."""
+    """Write a film of some episodes here: .gif, .webp, or .mp4 (extra `video`)."""
     video_episodes: int = 3
-    """Episodes in the GIF, from the first scene."""
+    """Episodes in the film, from the first scene."""
 
 
 def main() -> None:

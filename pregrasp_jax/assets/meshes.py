@@ -4,10 +4,9 @@ One bad mesh never stops the rest: it becomes a `Refusal`, one line that names w
 """
 
 import logging
-import multiprocessing
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
 from pathlib import Path
@@ -28,6 +27,7 @@ from pregrasp_jax.assets.settings import (
     refuse_beside_sets,
     same_form,
 )
+from pregrasp_jax.assets.workers import WorkerPool
 from pregrasp_jax.types import HullBank
 
 Progress = Callable[[int, int, str], object]
@@ -187,7 +187,7 @@ def _results(jobs: Sequence[_Job]):
         else:
             pending.append((job, cached))
     if pending:
-        io.refuse_unwritable(pending[0][1])
+        io.refuse_unwritable_cache(pending[0][1])
     for index, made in _decompose_all([job for job, _ in pending]):
         job, cached = pending[index]
         result = _finish(made) if isinstance(made, ConvexObject) else made
@@ -222,7 +222,7 @@ def _decompose_all(jobs: Sequence[_Job]):
     for width in (_WORKERS, 1):
         batches = [list(unfinished)] if width > 1 else [[index] for index in unfinished]
         for batch in filter(None, batches):
-            with ProcessPoolExecutor(width, mp_context=multiprocessing.get_context("spawn")) as pool:
+            with WorkerPool(width) as pool:
                 futures = {pool.submit(_try_job, jobs[index]): index for index in batch}
                 for future in as_completed(futures):
                     if not isinstance(future.exception(), BrokenProcessPool):
@@ -231,8 +231,7 @@ def _decompose_all(jobs: Sequence[_Job]):
     for index in unfinished:
         yield (
             index,
-            "the worker process died; allowed are meshes that CoACD can decompose (a script of your own must "
-            "guard its entry point with `if __name__ == '__main__'`)",
+            "the worker process died; allowed are meshes that CoACD can decompose",
         )
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from pregrasp_jax import io
 from pregrasp_jax.cli.film import film_episodes
+from pregrasp_jax.cli.outputs import refuse_unwritable
 from pregrasp_jax.cli.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.cli.progress import EpisodeProgress
 from pregrasp_jax.evaluation import format_evaluation
@@ -17,14 +18,14 @@ def evaluate(
     Args:
         request: what to evaluate.
         json_file: where the evaluation document goes.
-        video: where a GIF of the first `video_episodes` episodes goes.
+        video: where a film of the first `video_episodes` episodes goes.
         video_episodes: at most `request.episodes`.
 
     Raises:
         ValueError: something of the request cannot be used, or a file could not be written afterwards.
     """
-    for path in (json_file, video):
-        refuse_unwritable(path)
+    refuse_unwritable(json_file, "json")
+    refuse_unwritable(video, "film")
     if video and not 1 <= video_episodes <= request.episodes:
         raise ValueError(f"video_episodes = {video_episodes} is out of range; allowed is 1 to {request.episodes}")
     with EpisodeProgress() as progress:
@@ -36,16 +37,3 @@ def evaluate(
         if video:
             progress.say(f"drawing {video_episodes} episodes")
             film_episodes(video, player, episodes=video_episodes, seed=request.seed)
-
-
-def refuse_unwritable(path: Path | None) -> None:
-    """Refuse a file that could not be written, before hours of work are spent on its content.
-
-    Raises:
-        ValueError: it is a folder, or its folder does not allow writing.
-    """
-    if path is None:
-        return
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; allowed is the name of a file")
-    io.refuse_unwritable(path)

@@ -16,8 +16,8 @@ from pregrasp_jax.env import Env, make_env, with_task
 from pregrasp_jax.evaluation import Evaluator, Progress, evaluation_document
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.policies import Policy
+from pregrasp_jax.startup import prepare
 from pregrasp_jax.training.console import announced_compilation
-from pregrasp_jax.training.program import enable_compilation_cache
 
 NUM_ENVS = 16
 """Scenes side by side, enough to keep the engine's threads busy."""
@@ -88,6 +88,7 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     Raises:
         ValueError: there is no such policy, or something of the request is out of range.
     """
+    prepare()
     trained = _load(request.policy)
     config = _environment_config(request, Config() if trained is None else trained.config)
     if trained is not None:
@@ -133,7 +134,6 @@ def run_evaluation(
     Raises:
         ValueError: more episodes than scenes.
     """
-    enable_compilation_cache()
     start = time.monotonic()
     default = LOOKAHEAD_NUM_ENVS if request.policy == "lookahead" else NUM_ENVS
     evaluator = Evaluator(player.env, num_envs=request.num_envs or default)

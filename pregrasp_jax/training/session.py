@@ -14,12 +14,13 @@ from pregrasp_jax.env import Env, make_env
 from pregrasp_jax.evaluation import Evaluator
 from pregrasp_jax.learning.learner import Params
 from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.startup import prepare
 from pregrasp_jax.training import processes, resources
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.dump import make_dump
 from pregrasp_jax.training.event_log import require_module
 from pregrasp_jax.training.interrupt import Interrupt
-from pregrasp_jax.training.program import enable_compilation_cache, make_program
+from pregrasp_jax.training.program import make_program
 from pregrasp_jax.training.run_folder import RunFolder, WatchedFolder, refuse_used
 from pregrasp_jax.training.sharding import make_layout
 from pregrasp_jax.training.trainer import CompileFn, EvaluateFn, Trainer
@@ -45,6 +46,7 @@ def train(config: Config, run_dir: Path, *, init_from: Path | None = None, conso
     Raises:
         ValueError: one line says what cannot be used, and what is allowed.
     """
+    prepare()
     if processes.is_first():
         refuse_used(run_dir)
     params = None if init_from is None else load_policy(init_from).params
@@ -59,6 +61,7 @@ def resume(config: Config, run_dir: Path, *, console: Console | None = None) -> 
         run_dir: folder of the run.
         console: told about progress.
     """
+    prepare()
     config = with_absolute_paths(config)
     folder = RunFolder.open(run_dir, config) if processes.is_first() else WatchedFolder(run_dir)
     with folder:
@@ -66,7 +69,6 @@ def resume(config: Config, run_dir: Path, *, console: Console | None = None) -> 
 
 
 def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
-    enable_compilation_cache()
     config.validate()
     if config.train.tensorboard:
         require_module()
