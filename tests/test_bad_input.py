@@ -355,6 +355,7 @@ def test_a_cache_that_cannot_be_written_is_refused_before_the_work(world, refusa
     monkeypatch.setattr(meshes, "WorkerPool", None)
     said = refusal(command_line)
     assert f"error: {world}/file/cache/{file}" in said and f"{world}/file is not a writable folder" in said
+    assert "PREGRASP_JAX_CACHE names another folder for the cache" in said
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ def _encode_mp4(frames: Sequence[np.ndarray], seconds: float) -> bytes:
 
     buffer, repeats = io.BytesIO(), max(1, round(seconds * _FRAME_RATE))
     rows, columns = frames[0].shape[:2]
-    with av.open(buffer, "w", format="mp4", options={"movflags": "faststart"}) as container:
+    with av.open(buffer, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=_FRAME_RATE, options={"crf": "18"})
         stream.height, stream.width, stream.pix_fmt = rows + rows % 2, columns + columns % 2, "yuv420p"
         for number in range(len(frames) * repeats):
