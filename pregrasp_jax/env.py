@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax import geometry, grid, heightmap, primitives
+from pregrasp_jax import geometry, grid, heightmap, primitives, startup
 from pregrasp_jax.assets.sets import load_bank_for
 from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.judge import judge
@@ -229,6 +229,7 @@ def make_env(
     Raises:
         ValueError: the objects or settings cannot be used; one line says why.
     """
+    startup.check()
     threads = config.physics.threads if threads is None else threads
     _refuse_empty_ring(config.task)
     bank = load_bank_for(config.assets.object_dir, config.assets.object_set)

@@ -170,8 +170,8 @@ def test_sets_and_folders(tmp_path):
         ("a.stl: {mass: 1, density: 300}", "both mass and density"),
         ("a.stl: [1, 2]", "is list; allowed is a mapping"),
         ("- a", "is list; allowed is a mapping"),
-        ("a: {b", "not valid YAML"),
-        ("a.stl: !!python/object/apply:os.getcwd []", "not valid YAML"),
+        ("a: {b", "line 1: while parsing a flow mapping"),
+        ("a.stl: !!python/object/apply:os.getcwd []", "line 1: could not determine a constructor"),
     ],
 )
 def test_wrong_settings_are_one_line(tmp_path, text, message):

@@ -290,7 +290,7 @@ def refusal(world, tmp_path, monkeypatch, capsys) -> Any:
     }
     for name, fake in fakes.items():
         monkeypatch.setattr(session, name, fake)
-    monkeypatch.setattr(meshes, "ProcessPoolExecutor", InlineExecutor)
+    monkeypatch.setattr(meshes, "WorkerPool", InlineExecutor)
     monkeypatch.setenv("PREGRASP_JAX_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
 
@@ -357,9 +357,10 @@ def test_a_replay_that_does_not_fit_is_refused_before_the_start(refusal, monkeyp
 )
 def test_a_cache_that_cannot_be_written_is_refused_before_the_work(world, refusal, monkeypatch, command_line, file):
     monkeypatch.setenv("PREGRASP_JAX_CACHE", str(world / "file" / "cache"))
-    monkeypatch.setattr(meshes, "ProcessPoolExecutor", None)
+    monkeypatch.setattr(meshes, "WorkerPool", None)
     said = refusal(command_line)
     assert f"error: {world}/file/cache/{file}" in said and f"{world}/file is not a writable folder" in said
+    assert "PREGRASP_JAX_CACHE names another folder for the cache" in said
 
 
 @pytest.mark.parametrize(

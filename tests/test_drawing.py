@@ -115,16 +115,16 @@ def test_contact_sheet_shows_every_object():
 
 def test_files_hold_what_was_drawn(tmp_path):
     frames = [np.full((20, 30, 3), value, np.uint8) for value in (10, 120, 240)]
-    drawing.save_png(tmp_path / "a.png", frames[1])
+    drawing.save_image(tmp_path / "a.png", frames[1])
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), frames[1])
-    drawing.save_gif(tmp_path / "a.gif", frames, seconds_per_frame=0.5)
+    drawing.save_film(tmp_path / "a.gif", frames, seconds_per_frame=0.5)
     movie = Image.open(tmp_path / "a.gif")
     assert getattr(movie, "n_frames", 1) == 3 and movie.info["duration"] == 500 and movie.info["loop"] == 0
     for i, frame in enumerate(frames):
         movie.seek(i)
         assert np.abs(np.asarray(movie.convert("RGB")).astype(int) - frame).max() <= 2
     with pytest.raises(ValueError, match="at least one frame"):
-        drawing.save_gif(tmp_path / "b.gif", [])
+        drawing.save_film(tmp_path / "b.gif", [])
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gif", "a.png"]
 
 

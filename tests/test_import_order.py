@@ -9,8 +9,8 @@ import pregrasp_jax
 
 PACKAGE = Path(pregrasp_jax.__file__).parent
 ORDER = [
-    ["io", "machine", "types"],
-    ["config", "geometry", "grid", "judge"],
+    ["io", "machine", "types", "yaml_file"],
+    ["config", "geometry", "grid", "judge", "startup"],
     ["assets"],
     ["robot"],
     ["scene"],

@@ -4,10 +4,9 @@ One bad mesh never stops the rest: it becomes a `Refusal`, one line that names w
 """
 
 import logging
-import multiprocessing
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
 from pathlib import Path
@@ -20,7 +19,15 @@ from pregrasp_jax import io
 from pregrasp_jax.assets import decompose
 from pregrasp_jax.assets.bank import FORMAT, ConvexObject, concatenate, load_bank, make_bank, save_bank
 from pregrasp_jax.assets.mesh_file import MAX_BYTES, SUFFIXES, load_mesh, one_line
-from pregrasp_jax.assets.settings import SETTINGS_FILE, UP_AXES, ObjectSettings, load_settings
+from pregrasp_jax.assets.settings import (
+    SETTINGS_FILE,
+    UP_AXES,
+    ObjectSettings,
+    load_settings,
+    refuse_beside_sets,
+    same_form,
+)
+from pregrasp_jax.assets.workers import WorkerPool
 from pregrasp_jax.types import HullBank
 
 Progress = Callable[[int, int, str], object]
@@ -90,7 +97,7 @@ def mesh_folder(object_dir: Path, object_set: str) -> Path:
     """Return the folder that holds the meshes of a set.
 
     Raises:
-        ValueError: it does not exist.
+        ValueError: it does not exist, or settings lie where they would not be read.
     """
     sets = ("seen", "unseen")
     if object_set not in sets:
@@ -99,6 +106,7 @@ def mesh_folder(object_dir: Path, object_set: str) -> Path:
         raise ValueError(f"{object_dir}: no such folder; allowed is a folder of {', '.join(SUFFIXES)} files")
     present = [name for name in sets if (object_dir / name).is_dir()]
     if object_set in present:
+        refuse_beside_sets(object_dir, present)
         return object_dir / object_set
     if present or object_set != "seen":
         raise ValueError(f"{object_dir}: has no '{object_set}' set; allowed here are {', '.join(present or ['seen'])}")
@@ -129,23 +137,27 @@ def tip_angle(bank: HullBank, index: int) -> float:
 def _list_jobs(folder: Path) -> tuple[list[_Job], list[Refusal]]:
     """Pair every mesh of a folder with its settings; refuse what is missing or leads out of the folder."""
     defaults, listed = load_settings(folder)
-    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+    meshes = (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+    paths = sorted(meshes, key=lambda path: same_form(path.name))
+    names = [same_form(path.name) for path in paths]
     refusals = [
         Refusal(name, f"listed in {SETTINGS_FILE} but {_why_absent(folder, name)}")
         for name in listed
-        if name not in {path.name for path in paths}
+        if name not in names
     ]
     if not paths:
         raise ValueError(f"{folder}: holds no mesh; allowed are {', '.join(SUFFIXES)} files")
     jobs = []
-    for path in paths:
+    for path, name in zip(paths, names, strict=True):
         if not path.is_file():  # first, since a link in a loop cannot be resolved
-            refusals.append(Refusal(path.name, "missing or not a file; allowed are files inside the folder"))
+            refusals.append(Refusal(name, "missing or not a file; allowed are files inside the folder"))
         elif not path.resolve().is_relative_to(folder.resolve()):
-            refusals.append(Refusal(path.name, "link that leads out of the folder; allowed are files inside of it"))
+            refusals.append(Refusal(name, "link that leads out of the folder; allowed are files inside of it"))
+        elif names.count(name) > 1:
+            refusals.append(Refusal(name, "two files have this name, in two Unicode forms; allowed is one of them"))
         else:
-            unique = sum(other.stem == path.stem for other in paths) == 1
-            jobs.append(_Job(path.stem if unique else path.name, path, listed.get(path.name, defaults)))
+            unique = sum(Path(other).stem == Path(name).stem for other in names) == 1
+            jobs.append(_Job(Path(name).stem if unique else name, path, listed.get(name, defaults)))
     return jobs, refusals
 
 
@@ -175,7 +187,7 @@ def _results(jobs: Sequence[_Job]):
         else:
             pending.append((job, cached))
     if pending:
-        io.refuse_unwritable(pending[0][1])
+        io.refuse_unwritable_cache(pending[0][1])
     for index, made in _decompose_all([job for job, _ in pending]):
         job, cached = pending[index]
         result = _finish(made) if isinstance(made, ConvexObject) else made
@@ -210,7 +222,7 @@ def _decompose_all(jobs: Sequence[_Job]):
     for width in (_WORKERS, 1):
         batches = [list(unfinished)] if width > 1 else [[index] for index in unfinished]
         for batch in filter(None, batches):
-            with ProcessPoolExecutor(width, mp_context=multiprocessing.get_context("spawn")) as pool:
+            with WorkerPool(width) as pool:
                 futures = {pool.submit(_try_job, jobs[index]): index for index in batch}
                 for future in as_completed(futures):
                     if not isinstance(future.exception(), BrokenProcessPool):
@@ -219,8 +231,7 @@ def _decompose_all(jobs: Sequence[_Job]):
     for index in unfinished:
         yield (
             index,
-            "the worker process died; allowed are meshes that CoACD can decompose (a script of your own must "
-            "guard its entry point with `if __name__ == '__main__'`)",
+            "the worker process died; allowed are meshes that CoACD can decompose",
         )
 
 

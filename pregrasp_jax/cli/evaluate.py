@@ -47,9 +47,9 @@ class Options:
     json: Path | None = None
     """Write the result here; `pregrasp-jax compare A.json B.json` pairs two of them."""
     video: Path | None = None
-    """Write a GIF of some episodes here."""
+    """Write a film of some episodes here: .gif, .webp, or .mp4 (extra `video`)."""
     video_episodes: int = 3
-    """Episodes in the GIF, from the first scene."""
+    """Episodes in the film, from the first scene."""
 
 
 def evaluate_options(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
@@ -83,19 +83,20 @@ def evaluate(
     Args:
         request: what to evaluate.
         json_file: where the evaluation document goes.
-        video: where a GIF of the first `video_episodes` episodes goes.
+        video: where a film of the first `video_episodes` episodes goes.
         video_episodes: at most `request.episodes`.
 
     Raises:
         ValueError: something of the request cannot be used, or a file could not be written afterwards.
     """
     from pregrasp_jax.cli.film import film_episodes
+    from pregrasp_jax.cli.outputs import refuse_unwritable
     from pregrasp_jax.cli.player import make_player, run_evaluation
     from pregrasp_jax.cli.progress import EpisodeProgress
     from pregrasp_jax.evaluation import format_evaluation
 
-    for path in (json_file, video):
-        refuse_unwritable(path)
+    refuse_unwritable(json_file, "json")
+    refuse_unwritable(video, "film")
     if video and not 1 <= video_episodes <= request.episodes:
         raise ValueError(f"video_episodes = {video_episodes} is out of range; allowed is 1 to {request.episodes}")
     with EpisodeProgress() as progress:
@@ -107,16 +108,3 @@ def evaluate(
         if video:
             progress.say(f"drawing {video_episodes} episodes")
             film_episodes(video, player, episodes=video_episodes, seed=request.seed)
-
-
-def refuse_unwritable(path: Path | None) -> None:
-    """Refuse a file that could not be written, before hours of work are spent on its content.
-
-    Raises:
-        ValueError: it is a folder, or its folder does not allow writing.
-    """
-    if path is None:
-        return
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; allowed is the name of a file")
-    io.refuse_unwritable(path)

@@ -12,13 +12,13 @@ import jax
 
 from pregrasp_jax import policies
 from pregrasp_jax.checkpoint import load_policy
-from pregrasp_jax.config import AssetsConfig, Camera, Config, PhysicsConfig, SceneConfig
+from pregrasp_jax.config import AssetsConfig, Camera, Config, PhysicsConfig, SceneConfig, with_absolute_paths
 from pregrasp_jax.env import Env, make_env, with_task
 from pregrasp_jax.evaluation import Evaluator, Progress, evaluation_document
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.policies import Policy
+from pregrasp_jax.startup import prepare
 from pregrasp_jax.training.console import announced_compilation
-from pregrasp_jax.training.program import enable_compilation_cache
 
 NUM_ENVS = 16
 """Scenes side by side, enough to keep the engine's threads busy."""
@@ -89,11 +89,14 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     Raises:
         ValueError: there is no such policy, or something of the request is out of range.
     """
+    prepare()
     trained = _load(request.policy)
     config = _environment_config(request, Config() if trained is None else trained.config)
-    if trained is not None and trained.config.assets.object_dir != request.assets.object_dir:
-        folders = (trained.config.assets.object_dir, request.assets.object_dir)
-        say("note: trained on {}, evaluated on {}".format(*(folder or "the built-in objects" for folder in folders)))
+    if trained is not None:
+        folders = [with_absolute_paths(made).assets.object_dir for made in (trained.config, config)]
+        if folders[0] != folders[1]:
+            names = (folder or "the built-in objects" for folder in folders)
+            say("note: trained on {}, evaluated on {}".format(*names))
 
     def packed(done: int, total: int) -> None:
         if done == total or done % _PACKING < 16:
@@ -129,7 +132,6 @@ def run_evaluation(
     Raises:
         ValueError: more episodes than scenes.
     """
-    enable_compilation_cache()
     start = time.monotonic()
     default = LOOKAHEAD_NUM_ENVS if request.policy == "lookahead" else NUM_ENVS
     evaluator = Evaluator(player.env, num_envs=request.num_envs or default)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pregrasp_jax.checkpoint import Policy, checksum, load_policy
 from pregrasp_jax.checkpoint.state import exists
-from pregrasp_jax.cli.evaluate import refuse_unwritable
 from pregrasp_jax.cli.film import Decision, Tiles, describe_decision, draw_tiles, make_play
+from pregrasp_jax.cli.outputs import refuse_unwritable
 from pregrasp_jax.cli.player import EvaluationConfig, Player, make_player
 from pregrasp_jax.config import AssetsConfig
 from pregrasp_jax.env import Env
@@ -17,7 +17,7 @@ from pregrasp_jax.report import Film, RunRecord, Step, load_evaluations, read_ru
 from pregrasp_jax.report.page import REPORT, kept_episodes
 from pregrasp_jax.report.record import SECONDS
 from pregrasp_jax.report.results import evaluation_files, is_of_run
-from pregrasp_jax.training.program import enable_compilation_cache
+from pregrasp_jax.startup import prepare
 
 FILMS, MOST_SCENES = 3, 30
 """Successes and failures to show, and scenes that are played to find them."""
@@ -56,7 +56,8 @@ def report(
             raise ValueError(f"{name} = {value} is out of range; allowed is {lowest} and more")
     run = read_run(run_dir)
     load_evaluations(run, evaluations)  # a damaged one is refused now, not after minutes of playing
-    refuse_unwritable(html or run_dir / REPORT)
+    refuse_unwritable(html or run_dir / REPORT, "html")
+    prepare()
     policy = find_policy(run) if films else None
     shown, note = film_run(run, films=films, scenes=scenes) if films else ([], "")
     path = write_page(run, shown, note, policy=policy, evaluations=evaluations, html=html)
@@ -151,7 +152,6 @@ def film_run(run: RunRecord, *, films: int, scenes: int, say: Say = print) -> tu
     Returns:
         Episodes, successes first, and one sentence that says how they were found.
     """
-    enable_compilation_cache()
     assets = AssetsConfig(
         object_dir=run.setting("assets", "object_dir", None), object_set=run.setting("assets", "object_set", "seen")
     )

@@ -1,8 +1,7 @@
 """Maps of the grid as seen from above: world +x to the right and +y up, so row 0 is the bottom of the picture."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
-import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw
 
@@ -12,7 +11,7 @@ from pregrasp_jax.drawing.shaded import instance_colors
 
 def draw_heightmap(height: np.ndarray, *, size: int = 300) -> np.ndarray:
     """Draw heights [H, W], uint8 as observed, as a map of size x size pixels; brighter is higher."""
-    return _as_map(matplotlib.colormaps["cividis"](np.asarray(height, np.uint8))[..., :3] * 255, size)
+    return _as_map(_colormap("cividis")(np.asarray(height, np.uint8))[..., :3] * 255, size)
 
 
 def draw_segmentation(instance_ids: np.ndarray, *, target_slot: int | None = None, size: int = 300) -> np.ndarray:
@@ -45,7 +44,7 @@ def draw_q_map(
     q, mask = np.asarray(q, float), np.asarray(mask, bool)
     inside = q[mask] if mask.any() else np.zeros(1)
     low, high = limits or (inside.min(), inside.max())
-    colors = matplotlib.colormaps["inferno"](np.clip((q - low) / max(high - low, 1e-9), 0, 1))[..., :3] * 255
+    colors = _colormap("inferno")(np.clip((q - low) / max(high - low, 1e-9), 0, 1))[..., :3] * 255
     shade = np.zeros(q.shape) if backdrop is None else np.asarray(backdrop, float) / 255
     image = _as_map(np.where(mask[..., None], colors, 70 + 110 * shade[..., None]), size)
     picture = Image.fromarray(image)
@@ -57,6 +56,13 @@ def draw_q_map(
     if push is not None:
         _draw_arrow(canvas, *(_to_pixel(point, size) for point in push))
     return np.asarray(picture)
+
+
+def _colormap(name: str) -> Callable[[np.ndarray], np.ndarray]:
+    """Return values (uint8, or 0 to 1) -> RGBA in 0 to 1."""
+    import matplotlib  # here, since it comments on a home folder that it cannot write
+
+    return matplotlib.colormaps[name]
 
 
 def _as_map(values: np.ndarray, size: int) -> np.ndarray:

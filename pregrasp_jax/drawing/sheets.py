@@ -1,8 +1,6 @@
-"""Pictures side by side: the panel of one decision, the contact sheet of a bank; and their files."""
+"""Pictures side by side: the panel of one decision, the contact sheet of a bank."""
 
-import io
 from collections.abc import Sequence
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +10,6 @@ from pregrasp_jax import grid
 from pregrasp_jax.drawing.maps import draw_heightmap, draw_q_map, draw_segmentation
 from pregrasp_jax.drawing.shaded import draw_camera, look_at, side_view
 from pregrasp_jax.heightmap import HullInstances, object_hulls
-from pregrasp_jax.io import write_bytes
 from pregrasp_jax.types import CLOSED, OPEN, HullBank, Observation
 
 _INK, _PAPER = (38, 40, 44), (250, 249, 246)
@@ -84,28 +81,6 @@ def contact_sheet(bank: HullBank, *, columns: int = 6) -> np.ndarray:
     rows = [_row(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
     width = max(row.shape[1] for row in rows)
     return np.concatenate([np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=250) for r in rows])
-
-
-def save_png(path: Path, image: np.ndarray) -> None:
-    """Write an image as PNG, whole or not at all."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="PNG")
-    write_bytes(Path(path), buffer.getvalue())
-
-
-def save_gif(path: Path, frames: Sequence[np.ndarray], *, seconds_per_frame: float = 1.0) -> None:
-    """Write images of one shape as an endless animation, whole or not at all.
-
-    Raises:
-        ValueError: no frames.
-    """
-    if not frames:
-        raise ValueError(f"{path}: an animation needs at least one frame")
-    pictures = [Image.fromarray(frame).quantize(128, dither=Image.Dither.NONE) for frame in frames]
-    buffer = io.BytesIO()
-    duration = round(1000 * seconds_per_frame)
-    pictures[0].save(buffer, format="GIF", save_all=True, append_images=pictures[1:], duration=duration, loop=0)
-    write_bytes(Path(path), buffer.getvalue())
 
 
 def _row(tiles: Sequence[tuple[str, np.ndarray]], *, title: str = "", footer: str = "", gap: int = 8) -> np.ndarray:

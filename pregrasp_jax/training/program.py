@@ -1,10 +1,8 @@
 """The compiled parts of a training and the state that they share."""
 
 import dataclasses
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import flax.struct as struct
@@ -12,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax import io
 from pregrasp_jax.checkpoint.chunks import Ring
 from pregrasp_jax.config import Config
 from pregrasp_jax.learning.learner import Params
@@ -28,9 +25,6 @@ from pregrasp_jax.training.learn import (
     make_update,
 )
 from pregrasp_jax.training.sharding import Layout
-
-CACHE_SWITCH = "PREGRASP_JAX_COMPILATION_CACHE"
-"""Environment variable: 0 turns the compilation cache off, wherever it is."""
 
 
 class TrainState(struct.PyTreeNode):
@@ -229,20 +223,3 @@ def _compile(function: Callable[..., Any], arguments: tuple[Any, ...], shardings
     """Return a function compiled for its arguments and for where they and the result lie; it donates the first."""
     jitted = jax.jit(function, donate_argnums=0, in_shardings=shardings, out_shardings=result)
     return jitted.lower(*arguments).compile()
-
-
-def compilation_cache_dir() -> Path | None:
-    """Return where compiled programs are kept: the user's own choice for jax, or the cache folder; None if nowhere."""
-    if os.environ.get(CACHE_SWITCH) == "0":
-        return None
-    return Path(jax.config.values["jax_compilation_cache_dir"] or io.cache_dir() / "jax")
-
-
-def enable_compilation_cache() -> None:
-    """Keep compiled programs in `compilation_cache_dir`."""
-    folder = compilation_cache_dir()
-    if folder is None:
-        jax.config.update("jax_enable_compilation_cache", False)
-    elif not jax.config.values["jax_compilation_cache_dir"]:
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
