@@ -16,7 +16,7 @@ from trimesh.exchange.obj import export_obj
 
 from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
-from pregrasp_jax.assets.mesh_file import MAX_BYTES
+from pregrasp_jax.assets.formats import MAX_BYTES
 from pregrasp_jax.checkpoint import Ring, save, save_policy, trees, write_config
 from pregrasp_jax.config import PRESETS, ReplayConfig, TaskConfig
 from pregrasp_jax.training.dump import make_dump

@@ -19,7 +19,8 @@ from scipy.spatial import ConvexHull
 from pregrasp_jax import io
 from pregrasp_jax.assets import decompose
 from pregrasp_jax.assets.bank import FORMAT, ConvexObject, concatenate, load_bank, make_bank, save_bank
-from pregrasp_jax.assets.mesh_file import MAX_BYTES, SUFFIXES, load_mesh, one_line
+from pregrasp_jax.assets.formats import SUFFIXES, one_line, read_files
+from pregrasp_jax.assets.mesh_file import load_mesh
 from pregrasp_jax.assets.settings import SETTINGS_FILE, UP_AXES, ObjectSettings, load_settings
 from pregrasp_jax.types import HullBank
 
