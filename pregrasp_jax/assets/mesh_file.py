@@ -8,6 +8,7 @@ import trimesh
 from pregrasp_jax.assets.decompose import repair
 from pregrasp_jax.assets.formats import read_files, read_surface
 from pregrasp_jax.assets.settings import SETTINGS_FILE, ObjectSettings
+from pregrasp_jax.assets.standing import doubt
 from pregrasp_jax.grid import MAX_HEIGHT
 
 MIN_OBJECT_HEIGHT = 0.11
@@ -28,6 +29,8 @@ _UNITS = (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254), ("ki
 def load_mesh(path: Path, settings: ObjectSettings) -> trimesh.Trimesh:
     """Read one mesh file, check it, and return it repaired, in metres, z up.
 
+    Its metadata says in `doubt` why it may stand on the wrong side, if there is such a reason.
+
     Raises:
         ValueError: one line about what is wrong with it.
     """
@@ -41,11 +44,14 @@ def load_mesh(path: Path, settings: ObjectSettings) -> trimesh.Trimesh:
     mesh = repair(trimesh.Trimesh(vertices, surface.faces, process=False))
     if len(mesh.faces) == 0:
         raise ValueError("all faces are degenerate or duplicates; allowed is a surface that encloses a volume")
+    if settings.up is None:
+        mesh.metadata["doubt"] = doubt(mesh.vertices, mesh.faces, path.suffix.lower(), surface.up)
     return mesh
 
 
-def _upright(vertices: np.ndarray, up: str) -> np.ndarray:
+def _upright(vertices: np.ndarray, up: str | None) -> np.ndarray:
     """Rotate vertices so that the axis `up` becomes z: cyclic for the axis, half a turn about x for its sign."""
+    up = up or "z"
     vertices = np.roll(vertices, 2 - "xyz".index(up[-1]), axis=1)
     return vertices * [1.0, -1.0, -1.0] if up.startswith("-") else vertices
 
@@ -67,6 +73,8 @@ def _check_size(vertices: np.ndarray, settings: ObjectSettings) -> None:
     if not MIN_OBJECT_HEIGHT <= size[2] <= MAX_OBJECT_HEIGHT:
         what = "too low" if size[2] < MIN_OBJECT_HEIGHT else "too tall"
         allowed = f"allowed heights are {MIN_OBJECT_HEIGHT:g} to {MAX_OBJECT_HEIGHT:g} m"
-        raise ValueError(f"{what}: {text}, up is {settings.up}; {allowed}, scale and up can be set in {SETTINGS_FILE}")
+        raise ValueError(
+            f"{what}: {text}, up is {settings.up or 'z'}; {allowed}, scale and up can be set in {SETTINGS_FILE}"
+        )
     if size[:2].max() > MAX_OBJECT_WIDTH:
         raise ValueError(f"too wide: {text}; allowed is a width up to {MAX_OBJECT_WIDTH:g} m")

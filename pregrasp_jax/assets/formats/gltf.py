@@ -45,7 +45,9 @@ def read_gltf(files: list[bytes]) -> Surface:
     document, chunk = _split(files[0])
     _refuse_unknown_extensions(document)
     external = iter(files[1:])
-    buffers = [_buffer(entry, chunk if i == 0 else None, external) for i, entry in enumerate(document.get("buffers", []))]
+    buffers = [
+        _buffer(entry, chunk if i == 0 else None, external) for i, entry in enumerate(document.get("buffers", []))
+    ]
     parts = []
     for node, matrix in _placed_nodes(document):
         if "mesh" in node:

@@ -46,7 +46,9 @@ def from_polygons(vertices: np.ndarray, sizes: np.ndarray, corners: np.ndarray) 
     vertices, sizes, corners = np.asarray(vertices, np.float64), np.asarray(sizes, int), np.asarray(corners, int)
     wrong = corners[(corners < 0) | (corners >= len(vertices))]
     if wrong.size:
-        raise ValueError(f"a face names vertex {wrong[0]} (counted from 0); allowed are the {len(vertices)} of the file")
+        raise ValueError(
+            f"a face names vertex {wrong[0]} (counted from 0); allowed are the {len(vertices)} of the file"
+        )
     starts = np.cumsum(sizes) - sizes
     faces = [np.zeros((0, 3), int)]
     for size in np.unique(sizes[sizes >= 3]):
@@ -102,9 +104,9 @@ def _cut_ears(vertices: np.ndarray, polygon: np.ndarray) -> np.ndarray:
     drop = int(np.argmax(np.abs(normal)))
     flat = np.delete(points - points.mean(axis=0), drop, axis=1)
     flat = flat[:, ::-1] if (normal[drop] < 0) != (drop == 1) else flat
-    triangles = mapbox_earcut.triangulate_float64(
-        np.ascontiguousarray(flat), np.array([len(flat)], np.uint32)
-    ).reshape(-1, 3)
+    triangles = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), np.array([len(flat)], np.uint32)).reshape(
+        -1, 3
+    )
     return polygon[_through_all_corners(flat, _anticlockwise(flat, triangles))]
 
 
