@@ -41,15 +41,15 @@ class Fit(NamedTuple):
         difference: share of the volume by which columns of the two differ in length; NaN likewise.
     """
 
-    mesh: tuple[float, float, float]
-    hulls: tuple[float, float, float]
+    mesh: np.ndarray
+    hulls: np.ndarray
     volume: float
     difference: float
 
     @property
     def off(self) -> float:
         """m, by how much the worst of the extents differs."""
-        return float(np.abs(np.subtract(self.hulls, self.mesh)).max())
+        return float(np.abs(self.hulls - self.mesh).max())
 
     @property
     def is_good(self) -> bool:
@@ -68,13 +68,12 @@ class Fit(NamedTuple):
 
     def as_numbers(self) -> list[float]:
         """Return all numbers in a row, for a file."""
-        return [*self.mesh, *self.hulls, self.volume, self.difference]
+        return [*self.mesh.tolist(), *self.hulls.tolist(), self.volume, self.difference]
 
     @classmethod
     def from_numbers(cls, numbers: list[float]) -> "Fit":
         """Return what `as_numbers` was called on."""
-        a, b, c, d, e, f, volume, difference = numbers
-        return cls((a, b, c), (d, e, f), volume, difference)
+        return cls(np.array(numbers[:3]), np.array(numbers[3:6]), *numbers[6:])
 
 
 def fit_parts(mesh: trimesh.Trimesh) -> tuple[tuple[np.ndarray, ...], Fit]:
@@ -109,10 +108,10 @@ def compare(mesh: trimesh.Trimesh, parts: tuple[np.ndarray, ...]) -> Fit:
     union = columns.cut(*_hull_surface(parts), x, y)
     wanted, found = solid.length[solid.known], union.length[solid.known]
     total = wanted.sum()
-    extents = [tuple(float(extent) for extent in np.ptp(p, axis=0)) for p in (vertices, points)]
+    sizes = np.ptp(vertices, axis=0), np.ptp(points, axis=0)
     if solid.known.mean() < _MIN_KNOWN or total <= 0:
-        return Fit(*extents, np.nan, np.nan)
-    return Fit(*extents, float(found.sum() / total), float(np.abs(found - wanted).sum() / total))
+        return Fit(sizes[0], sizes[1], np.nan, np.nan)
+    return Fit(sizes[0], sizes[1], float(found.sum() / total), float(np.abs(found - wanted).sum() / total))
 
 
 def _candidates(mesh: trimesh.Trimesh) -> Iterator[list[np.ndarray]]:

@@ -107,8 +107,9 @@ def load_object_dir(object_dir: Path, object_set: str, *, progress: Progress | N
     """Load every mesh of a folder as convex hulls, in the order of the file names.
 
     Args:
-        object_dir: folder of meshes, or of folders with one each, in m, z up (or as `objects.yaml` says); with subfolders `seen` and `unseen`
-            the one named by `object_set` is read, otherwise the folder itself is the seen set.
+        object_dir: folder of meshes, or of folders with one each, in m, z up (or as `objects.yaml` says); with
+            subfolders `seen` and `unseen` the one named by `object_set` is read, otherwise the folder itself is the
+            seen set.
         object_set: `seen` or `unseen`.
         progress: called after every mesh.
 
@@ -186,12 +187,10 @@ def tip_angle(bank: HullBank, index: int) -> float:
 
 def _strays(object_dir: Path, folder: Path) -> list[str]:
     """Return a line about the meshes that lie beside the folder of their set."""
+    if folder == object_dir:
+        return []
     names = sorted(path.name for path in object_dir.iterdir() if path.suffix.lower() in SUFFIXES)
-    return (
-        [f"{', '.join(names)}: beside the folder {folder.name}, whose meshes are read"]
-        if folder != object_dir and names
-        else []
-    )
+    return [f"{', '.join(names)}: beside the folder {folder.name}, whose meshes are read"] if names else []
 
 
 def _list_jobs(folder: Path) -> tuple[list[_Job], list[Refusal], list[str]]:

@@ -17,10 +17,11 @@ def read_collada(data: bytes) -> Surface:
         ValueError: pycollada is not installed, or the file is damaged.
     """
     collada = import_extra("collada", "the format .dae")
+    errors = collada.common
     document = collada.Collada(
         io.BytesIO(data),
         # A texture that is not there, or an effect that is not known, changes no shape.
-        ignore=[collada.DaeBrokenRefError, collada.DaeUnsupportedError, collada.DaeIncompleteError],
+        ignore=[errors.DaeBrokenRefError, errors.DaeUnsupportedError, errors.DaeIncompleteError],
         aux_file_loader=lambda name: None,
     )
     parts = []

@@ -28,7 +28,7 @@ class _Element(NamedTuple):
     """One table of the file."""
 
     name: str
-    count: int
+    num_rows: int
     properties: list[_Property]
 
 
@@ -55,7 +55,7 @@ def read_ply(data: bytes) -> Surface:
             else:
                 columns[element.name], body = _read_binary(element, body, order)
         except (StopIteration, RuntimeError, IndexError) as error:
-            raise ValueError(f"cut short: {element.count} rows of element '{element.name}' are announced") from error
+            raise ValueError(f"cut short: {element.num_rows} rows of element '{element.name}' are announced") from error
     vertex = columns.get("vertex", {})
     if not {"x", "y", "z"} <= vertex.keys():
         raise ValueError("has no element 'vertex' with x, y and z")
@@ -108,7 +108,7 @@ def _split_strips(rows: _Rows) -> list[np.ndarray]:
 def _read_text(element: _Element, words) -> dict[str, _Rows]:
     """Read the rows of one element from an iterator of words."""
     columns: list[tuple[list[str], list[int]]] = [([], []) for _ in element.properties]
-    for _ in range(element.count):
+    for _ in range(element.num_rows):
         for item, (values, sizes) in zip(element.properties, columns, strict=True):
             size = 1 if item.count_type is None else int(next(words))
             values += [next(words) for _ in range(size)]
@@ -121,24 +121,24 @@ def _read_text(element: _Element, words) -> dict[str, _Rows]:
 
 def _read_binary(element: _Element, data: bytes, order: str) -> tuple[dict[str, _Rows], bytes]:
     """Read the rows of one element, and return the rest: at once if all lists are as long as in the first row."""
-    if not element.count:
+    if not element.num_rows:
         return {item.name: _Rows(np.zeros(0, item.type), np.zeros(0, int)) for item in element.properties}, data
-    sizes, end = _list_sizes(element, data, 0, order)
+    sizes, _ = _list_sizes(element, data, 0, order)
     fields = []
     for item, size in zip(element.properties, sizes, strict=True):
         if item.count_type is not None:
             fields.append((f"{item.name} count", order + item.count_type))
         fields.append((item.name, order + item.type, (size,)))
     row = np.dtype(fields)
-    if row.itemsize * element.count <= len(data):
-        rows = np.frombuffer(data, row, element.count)
+    if row.itemsize * element.num_rows <= len(data):
+        rows = np.frombuffer(data, row, element.num_rows)
         lists = [(i, s) for i, s in zip(element.properties, sizes, strict=True) if i.count_type is not None]
         if all((rows[f"{item.name} count"] == size).all() for item, size in lists):
             columns = {
-                item.name: _Rows(rows[item.name].ravel(), np.full(element.count, size))
+                item.name: _Rows(rows[item.name].ravel(), np.full(element.num_rows, size))
                 for item, size in zip(element.properties, sizes, strict=True)
             }
-            return columns, data[row.itemsize * element.count :]
+            return columns, data[row.itemsize * element.num_rows :]
     return _read_binary_slowly(element, data, order)
 
 
@@ -146,7 +146,7 @@ def _read_binary_slowly(element: _Element, data: bytes, order: str) -> tuple[dic
     """Read rows whose lists differ in length, one by one."""
     parts: list[tuple[list[np.ndarray], list[int]]] = [([], []) for _ in element.properties]
     start = 0
-    for _ in range(element.count):
+    for _ in range(element.num_rows):
         sizes, end = _list_sizes(element, data, start, order)
         for item, size, (values, counts) in zip(element.properties, sizes, parts, strict=True):
             start += 0 if item.count_type is None else np.dtype(item.count_type).itemsize

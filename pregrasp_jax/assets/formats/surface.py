@@ -46,9 +46,7 @@ def from_polygons(vertices: np.ndarray, sizes: np.ndarray, corners: np.ndarray) 
     vertices, sizes, corners = np.asarray(vertices, np.float64), np.asarray(sizes, int), np.asarray(corners, int)
     wrong = corners[(corners < 0) | (corners >= len(vertices))]
     if wrong.size:
-        raise ValueError(
-            f"a face names vertex {wrong[0]} (counted from 0); allowed are the {len(vertices)} of the file"
-        )
+        raise ValueError(f"a face names vertex {wrong[0]} (from 0); allowed are the {len(vertices)} of the file")
     starts = np.cumsum(sizes) - sizes
     faces = [np.zeros((0, 3), int)]
     for size in np.unique(sizes[sizes >= 3]):

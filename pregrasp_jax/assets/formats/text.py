@@ -65,7 +65,9 @@ def read_off(data: bytes) -> Surface:
     corners = [int(word) for words, size in zip(faces, sizes, strict=True) for word in words[1 : 1 + size]]
     if len(corners) != sizes.sum():
         raise ValueError("a face has fewer corners than it announces")
-    return from_polygons(np.array([[float(w) for w in words[:3]] for words in rows]).reshape(-1, 3), sizes, corners)
+    return from_polygons(
+        np.array([[float(w) for w in words[:3]] for words in rows]).reshape(-1, 3), sizes, np.array(corners)
+    )
 
 
 def _corner(word: str, count: int) -> int:
@@ -77,7 +79,7 @@ def _corner(word: str, count: int) -> int:
 
 
 def _lines(data: bytes, *, joined: bool = False) -> Iterator[tuple[int, list[str]]]:
-    """Yield number and words of every line that is neither empty nor a comment; `\\` at its end may join two."""
+    """Yield number and words of every line that is neither empty nor a comment; a backslash may join two."""
     text = decode(data).replace("\r\n", "\n").replace("\r", "\n")
     if joined:
         text = text.replace("\\\n", " ")
