@@ -16,23 +16,8 @@ _SIMPLIFIED = ("collision", "coacd", "vhacd", "convex", "hull", "_col", "coll.")
 """In a name they mark meshes that somebody has simplified; the original is read where there is one."""
 
 _UNREAD = {
-    *(
-        ".3ds",
-        ".3mf",
-        ".abc",
-        ".amf",
-        ".blend",
-        ".ctm",
-        ".drc",
-        ".fbx",
-        ".iges",
-        ".igs",
-        ".lwo",
-        ".max",
-        ".msh",
-        ".pcd",
-    ),
-    *(".step", ".stp", ".usd", ".usda", ".usdc", ".usdz", ".vtk", ".vtp", ".wrl", ".x3d", ".xyz", ".zae"),
+    *(".3ds", ".3mf", ".abc", ".amf", ".blend", ".ctm", ".drc", ".fbx", ".iges", ".igs", ".lwo", ".max"),
+    *(".msh", ".pcd", ".step", ".stp", ".usd", ".usda", ".usdc", ".usdz", ".vtk", ".vtp", ".wrl", ".x3d", ".xyz"),
 }
 """Mesh formats that are not read."""
 

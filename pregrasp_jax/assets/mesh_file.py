@@ -39,7 +39,9 @@ def load_mesh(path: Path, settings: ObjectSettings) -> trimesh.Trimesh:
     bad = int((~np.isfinite(used).all(axis=1)).sum())
     if bad:
         raise ValueError(f"{bad} of {len(used)} vertices are NaN or infinite; allowed are finite coordinates")
-    _check_size(_upright(used * settings.scale, settings.up), settings)
+    said = surface.up if settings.up is None and surface.up != "z" else None
+    hint = f" (by its {path.suffix.lower()} format, {said})" if said else ""
+    _check_size(_upright(used * settings.scale, settings.up), settings, hint)
     vertices = _upright(surface.vertices * settings.scale, settings.up)
     mesh = repair(trimesh.Trimesh(vertices, surface.faces, process=False))
     if len(mesh.faces) == 0:
@@ -56,7 +58,7 @@ def _upright(vertices: np.ndarray, up: str | None) -> np.ndarray:
     return vertices * [1.0, -1.0, -1.0] if up.startswith("-") else vertices
 
 
-def _check_size(vertices: np.ndarray, settings: ObjectSettings) -> None:
+def _check_size(vertices: np.ndarray, settings: ObjectSettings, up_hint: str) -> None:
     """Refuse wrong units, flat objects, and objects outside of what the task can handle."""
     size = np.ptp(vertices, axis=0)
     text = " x ".join(f"{extent * 1e3:.4g}" for extent in size) + " mm"
@@ -74,7 +76,7 @@ def _check_size(vertices: np.ndarray, settings: ObjectSettings) -> None:
         what = "too low" if size[2] < MIN_OBJECT_HEIGHT else "too tall"
         allowed = f"allowed heights are {MIN_OBJECT_HEIGHT:g} to {MAX_OBJECT_HEIGHT:g} m"
         raise ValueError(
-            f"{what}: {text}, up is {settings.up or 'z'}; {allowed}, scale and up can be set in {SETTINGS_FILE}"
+            f"{what}: {text}, up is {settings.up or 'z'}{up_hint}; {allowed}, scale and up can be set in {SETTINGS_FILE}"
         )
     if size[:2].max() > MAX_OBJECT_WIDTH:
         raise ValueError(f"too wide: {text}; allowed is a width up to {MAX_OBJECT_WIDTH:g} m")
