@@ -75,8 +75,7 @@ def _check_size(vertices: np.ndarray, settings: ObjectSettings, up_hint: str) ->
     if not MIN_OBJECT_HEIGHT <= size[2] <= MAX_OBJECT_HEIGHT:
         what = "too low" if size[2] < MIN_OBJECT_HEIGHT else "too tall"
         allowed = f"allowed heights are {MIN_OBJECT_HEIGHT:g} to {MAX_OBJECT_HEIGHT:g} m"
-        raise ValueError(
-            f"{what}: {text}, up is {settings.up or 'z'}{up_hint}; {allowed}, scale and up can be set in {SETTINGS_FILE}"
-        )
+        up = f"{settings.up or 'z'}{up_hint}"
+        raise ValueError(f"{what}: {text}, up is {up}; {allowed}, scale and up can be set in {SETTINGS_FILE}")
     if size[:2].max() > MAX_OBJECT_WIDTH:
         raise ValueError(f"too wide: {text}; allowed is a width up to {MAX_OBJECT_WIDTH:g} m")
