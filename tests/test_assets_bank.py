@@ -76,7 +76,7 @@ def test_eligibility_and_its_reason(bank):
     assert "narrowest width 120.0 mm, must be < 105" in ineligibility(bank, 1)
 
 
-@pytest.mark.parametrize(("coverage", "said"), [(0.97, "0.970"), (0.9699, "0.969"), (0.5, "0.500")])
+@pytest.mark.parametrize(("coverage", "said"), [(0.96999, "0.969"), (0.9651, "0.965"), (0.5, "0.500")])
 def test_rounding_does_not_hide_why_a_coverage_is_too_small(bank, coverage, said):
     changed = bank.replace(best_coverage=np.array([coverage] * 3, np.float32))
     assert ineligibility(changed, 0) == f"best coverage {said}, must be > 0.97"

@@ -135,23 +135,30 @@ def test_cache_is_used_and_depends_on_content_settings_and_health(tmp_path, cach
 def test_cache_depends_on_the_buffers_of_a_gltf(tmp_path, monkeypatch):
     monkeypatch.setattr(meshes, "ProcessPoolExecutor", InlineExecutor)
     document, buffer = with_uri("m.bin")
-    (tmp_path / "m.gltf").write_bytes(document)
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "m.gltf").write_bytes(document)
     heights = []
     for scale in (1.0, 1.2):
         corners = np.frombuffer(buffer[:96], "<f4") * np.float32(scale)
-        (tmp_path / "m.bin").write_bytes(corners.tobytes() + buffer[96:])
-        loaded = load_object_dir(tmp_path, "seen")
+        (tmp_path / "set" / "m.bin").write_bytes(corners.tobytes() + buffer[96:])
+        loaded = load_object_dir(tmp_path / "set", "seen")
         assert loaded.unused == []
         heights.append(float(loaded.bank.height[0]))
     np.testing.assert_allclose(heights, [0.15, 0.18], atol=1e-6)
-    (tmp_path / "m.bin").unlink()
-    assert load_object_dir(tmp_path, "seen").refusals[0].reason.startswith("its buffer 'm.bin' is missing; allowed")
+    (tmp_path / "set" / "m.bin").unlink()
+    assert (
+        load_object_dir(tmp_path / "set", "seen")
+        .refusals[0]
+        .reason.startswith("its buffer 'm.bin' is missing; allowed")
+    )
 
 
 def test_a_format_whose_library_is_missing_says_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(meshes, "ProcessPoolExecutor", InlineExecutor)
     monkeypatch.setitem(sys.modules, "collada", None)
-    (tmp_path / "m.dae").write_bytes(b"<?xml version='1.0'?><COLLADA/>")
-    (refusal,) = load_object_dir(tmp_path, "seen").refusals
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "m.dae").write_bytes(b"<?xml version='1.0'?><COLLADA/>")
+    (refusal,) = load_object_dir(tmp_path / "set", "seen").refusals
     assert "the format .dae requires collada; install it with pip install 'pregrasp_jax[formats]'" in refusal.reason
 
 
@@ -161,24 +168,24 @@ def test_a_folder_for_each_object(tmp_path, monkeypatch):
     for name in (
         "003_box/google_16k/textured.obj",
         "003_box/google_16k/nontextured.stl",
-        "004_can/collision_vhacd.obj",
+        "004_can/vhacd.obj",
     ):
-        write(tmp_path / name, box())
-    write(tmp_path / "004_can/meshes/visual.ply", box(height=0.2))
-    write(tmp_path / "mug.stl", box(height=0.13))
-    write(tmp_path / "mug/mug.stl", box(height=0.14))
+        write(tmp_path / "set" / name, box())
+    write(tmp_path / "set" / "004_can/meshes/visual.ply", box(height=0.2))
+    write(tmp_path / "set" / "mug.stl", box(height=0.13))
+    write(tmp_path / "set" / "mug/mug.stl", box(height=0.14))
     for name in (
         "003_box/google_16k/textured.mtl",
         "003_box/google_16k/map.png",
         "004_can/model.urdf",
         "004_can/a.mtl",
     ):
-        (tmp_path / name).write_text("")
-    (tmp_path / "mug/textured.mtl").write_text("")
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "teapot.fbx").write_text("")
-    (tmp_path / "objects.yaml").write_text("003_box: {mass: 0.4}\n004_can/vhacd.obj: {mass: 0.2}\nmug.stl:\n")
-    loaded = load_object_dir(tmp_path, "seen")
+        (tmp_path / "set" / name).write_text("")
+    (tmp_path / "set" / "mug/textured.mtl").write_text("")
+    (tmp_path / "set" / "empty").mkdir()
+    (tmp_path / "set" / "teapot.fbx").write_text("")
+    (tmp_path / "set" / "objects.yaml").write_text("003_box: {mass: 0.4}\n004_can/vhacd.obj: {mass: 0.2}\nmug.stl:\n")
+    loaded = load_object_dir(tmp_path / "set", "seen")
     assert loaded.bank.names == ("003_box", "004_can", "mug.stl", "mug/mug.stl")
     np.testing.assert_allclose(loaded.bank.mass[:2], [0.4, 0.2])
     np.testing.assert_allclose(loaded.bank.height, [0.15, 0.15, 0.13, 0.14], atol=1e-6)
@@ -196,21 +203,24 @@ def test_a_folder_for_each_object(tmp_path, monkeypatch):
 
 def test_the_original_is_read_before_what_was_simplified(tmp_path):
     for name in ("can/model.obj", "can/a_collision_0.obj", "can/z/model.stl"):
-        write(tmp_path / name, box())
-    (found,) = find_meshes(tmp_path, ()).meshes
+        write(tmp_path / "set" / name, box())
+    (found,) = find_meshes(tmp_path / "set", ()).meshes
     assert (found.name, found.key) == ("can", "can/model.obj")
 
 
 def test_meshes_beside_the_folders_of_the_sets_are_told(tmp_path, monkeypatch):
     monkeypatch.setattr(meshes, "ProcessPoolExecutor", InlineExecutor)
-    write(tmp_path / "seen" / "a.stl", box())
-    write(tmp_path / "stray.stl", box())
-    assert load_object_dir(tmp_path, "seen").unused == ["stray.stl: beside the folder seen, whose meshes are read"]
+    write(tmp_path / "set" / "seen" / "a.stl", box())
+    write(tmp_path / "set" / "stray.stl", box())
+    assert load_object_dir(tmp_path / "set", "seen").unused == [
+        "stray.stl: beside the folder seen, whose meshes are read"
+    ]
 
 
 def test_a_set_up_axis_is_not_doubted(tmp_path):
-    (tmp_path / "m.glb").write_bytes(glb(*float_document()))
-    assert "doubt" not in load_mesh(tmp_path / "m.glb", ObjectSettings(up="z")).metadata
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "m.glb").write_bytes(glb(*float_document()))
+    assert "doubt" not in load_mesh(tmp_path / "set" / "m.glb", ObjectSettings(up="z")).metadata
 
 
 def test_an_unreadable_mesh_costs_one_mesh(tmp_path, monkeypatch):
