@@ -3,12 +3,14 @@
 import base64
 import json
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
+from trimesh.exchange.gltf import export_glb
+from trimesh.exchange.stl import export_stl_ascii
 
 Box = tuple[float, float, float]
 
@@ -39,9 +41,9 @@ U_PROFILE = [(0, 0), (80, 0), (80, 80), (60, 80), (60, 20), (20, 20), (20, 80), 
 """mm; 4.0 of 6.4 mm^2 of its rectangle, 0.180 kg over 150 mm."""
 
 
-def prism(outline: list[tuple[float, float]], height: float, start: int = 0) -> tuple[np.ndarray, list[list[int]]]:
+def prism(outline: Sequence[tuple[float, float]], height: float, start: int = 0) -> tuple[np.ndarray, list[list[int]]]:
     """Return vertices [2N, 3] m and polygons of an upright prism whose caps are one polygon each, from a corner on."""
-    outline = outline[start:] + outline[:start]
+    outline = [*outline[start:], *outline[:start]]
     n = len(outline)
     vertices = np.array([(x, y, z) for z in (0.0, height) for x, y in outline]) / 1000
     sides = [[i, (i + 1) % n, n + (i + 1) % n, n + i] for i in range(n)]
@@ -153,7 +155,7 @@ def strip_document() -> tuple[dict[str, Any], bytes]:
 
 
 def draco_box() -> bytes:
-    return trimesh.exchange.gltf.export_glb(trimesh.Scene(BOX), extension_draco=True)
+    return export_glb(trimesh.Scene(BOX), extension_draco=True)
 
 
 def turned(document: dict[str, Any]) -> dict[str, Any]:
@@ -264,14 +266,14 @@ CASES: dict[str, Callable[[], Case]] = {
     "glb cut short": lambda: Case("m.glb", glb(*float_document())[:-40], said="cut short"),
     "glb y up": lambda: Case(
         "m.glb",
-        trimesh.exchange.gltf.export_glb(trimesh.Scene(lying_mug())),
+        export_glb(trimesh.Scene(lying_mug())),
         (116.0, 120.0, 116.0),
         0.3795,
         "on its side",
     ),
     "glb y up and low": lambda: Case(
         "m.glb",
-        trimesh.exchange.gltf.export_glb(trimesh.Scene(trimesh.creation.box((0.06, 0.15, 0.07)))),
+        export_glb(trimesh.Scene(trimesh.creation.box((0.06, 0.15, 0.07)))),
         said="too low: 60 x 150 x 70 mm, up is z (by its .glb format, y); allowed heights",
     ),
     "gltf": lambda: Case("m.gltf", with_uri("a b.bin")[0], SIZE, MASS, "it is y", {"a b.bin": with_uri("")[1]}),
@@ -294,7 +296,7 @@ CASES: dict[str, Callable[[], Case]] = {
     ),
     "stl latin-1": lambda: Case(
         "m.stl",
-        trimesh.exchange.stl.export_stl_ascii(BOX).encode().replace(b"solid", "solid Größe".encode("latin-1"), 1),
+        export_stl_ascii(BOX).encode().replace(b"solid", "solid Größe".encode("latin-1"), 1),
         SIZE,
         MASS,
     ),
