@@ -24,7 +24,7 @@ class AssetsConfig:
     """Which objects."""
 
     object_dir: str | None = None
-    """Folder of .obj/.stl/.ply/.glb meshes (DIR/seen and DIR/unseen if present); None is the built-in catalogue."""
+    """Folder of meshes, see docs/meshes.md (DIR/seen and DIR/unseen if present); None is the built-in catalogue."""
     object_set: ObjectSet = "seen"
     """Training uses `seen`; `unseen` holds objects kept for evaluation (Sec. IV-A)."""
 

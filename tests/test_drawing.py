@@ -3,11 +3,12 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from heightmap_oracle import box_cloud, make_instances, pad
 from PIL import Image
 
 from pregrasp_jax import drawing, grid
-from pregrasp_jax.assets.bank import select
+from pregrasp_jax.assets.bank import ConvexObject, make_bank, select
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.drawing import shaded
 from pregrasp_jax.types import OPEN, ROBOT_ID, Observation
@@ -111,6 +112,17 @@ def test_contact_sheet_shows_every_object():
     assert sheet.shape[0] == 2 * (sheet.shape[0] // 2)
     for half in np.split(sheet, 2):
         assert color_of(half.astype(float), drawing.OBSTACLE_COLORS[0]).mean() > 0.02
+
+
+def test_contact_sheet_shows_the_tallest_object_whole():
+    """A head that is cut off reaches the upper edge of its picture, where a low object leaves only floor."""
+    tall, low = (
+        np.asarray(trimesh.creation.box((0.2, 0.2, height)).vertices) + np.array([0, 0, height / 2])
+        for height in (0.30, 0.02)
+    )
+    pictures = [drawing.contact_sheet(make_bank([ConvexObject("x", [part])]))[8:228, 8:228] for part in (tall, low)]
+    differs = (pictures[0] != pictures[1]).any(axis=2)
+    assert differs[60:].any() and not differs[:3].any() and not differs[:, :3].any() and not differs[:, -3:].any()
 
 
 def test_files_hold_what_was_drawn(tmp_path):

@@ -1,8 +1,9 @@
 """The hull bank: build it from convex parts, join, select, save and load it."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -105,18 +106,27 @@ def ineligibility(bank: HullBank, index: int) -> str:
     width, coverage = float(bank.min_width[index]), float(bank.best_coverage[index])
     reasons = []
     if width >= MAX_TARGET_WIDTH:
-        reasons.append(f"narrowest width {width * 1e3:.0f} mm, must be < {MAX_TARGET_WIDTH * 1e3:.0f}")
+        reasons.append(f"narrowest width {width * 1e3:.1f} mm, must be < {MAX_TARGET_WIDTH * 1e3:.0f}")
     if coverage <= MIN_TARGET_COVERAGE:
-        reasons.append(f"best coverage {coverage:.2f}, must be > {MIN_TARGET_COVERAGE}")
+        # Rounded down, so that what is just too small does not read as if it were enough.
+        reasons.append(f"best coverage {np.floor(coverage * 1000) / 1000:.3f}, must be > {MIN_TARGET_COVERAGE}")
     return "; ".join(reasons)
 
 
-def save_bank(path: Path, bank: HullBank) -> None:
-    """Write a bank as npz, whole or not at all."""
+def save_bank(path: Path, bank: HullBank, *, about: Mapping[str, Any] | None = None) -> None:
+    """Write a bank as npz, whole or not at all.
+
+    Args:
+        path: the file.
+        bank: the bank.
+        about: JSON-able remarks that `load_about` returns; they are no part of the bank and of its hash.
+    """
     arrays = {
         f"{level}_{key}": value for level in ("full", "coarse") for key, value in vars(getattr(bank, level)).items()
     }
     arrays |= {key: getattr(bank, key) for key in ("object_hulls", *_PER_OBJECT)}
+    if about is not None:
+        arrays["about"] = np.array(json.dumps(about))
     io.write_npz(
         path,
         format=np.array(FORMAT),
@@ -135,6 +145,7 @@ def load_bank(path: Path) -> HullBank:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
+        arrays.pop("about", None)
         if str(arrays.pop("format")) != FORMAT:
             raise ValueError("format differs")
         recorded = str(arrays.pop("content_hash"))
@@ -152,6 +163,19 @@ def load_bank(path: Path) -> HullBank:
     except Exception as error:
         raise ValueError(f"{path}: not a readable '{FORMAT}' file ({error}); delete it and build it again") from error
     return bank
+
+
+def load_about(path: Path) -> dict[str, Any]:
+    """Return the remarks that a bank was written with; none if there are none.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return json.loads(str(file["about"])) if "about" in file else {}
+    except Exception as error:
+        raise ValueError(f"{path}: not a readable '{FORMAT}' file ({error}); delete it and build it again") from error
 
 
 def _empty() -> HullBank:

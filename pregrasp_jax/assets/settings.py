@@ -36,8 +36,8 @@ class ObjectSettings:
 
     scale: float = 1.0
     """Metres per unit of the file; 0.001 for millimetres."""
-    up: str = "z"
-    """The axis of the file that points up when the object stands: x, y, z, -x, -y or -z."""
+    up: str | None = None
+    """The axis of the file that points up when the object stands: x, y, z, -x, -y or -z; None is z, with doubts."""
     mass: float | None = None
     """kg; None is `density` times the volume of the hulls."""
     density: float = DEFAULT_DENSITY

@@ -9,7 +9,7 @@ import numpy as np
 
 from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
-from pregrasp_jax.assets.meshes import Refusal, load_object_dir
+from pregrasp_jax.assets.meshes import LoadedDir, load_object_dir
 from pregrasp_jax.assets.sets import format_table
 from pregrasp_jax.cli import doctor as machine_doctor
 from pregrasp_jax.cli.film import draw_decision, draw_scenes
@@ -35,8 +35,8 @@ def assets(
     """List the objects of a mesh folder (or the built-in ones): hulls, size, mass, whether they can be targets.
 
     Args:
-        object_dir: folder of .obj/.stl/.ply/.glb meshes, with subfolders seen and unseen or without; the built-in
-            catalogue if left out.
+        object_dir: folder of .obj/.stl/.ply/.glb/.gltf/.off/.dae meshes, or of folders with one each, with
+            subfolders seen and unseen or without; the built-in catalogue if left out.
         object_set: only this set; all that there are if left out.
         png: contact sheet of the objects, .png, .jpg, .jpeg or .webp; with two sets their names are added to that of
             the file.
@@ -45,11 +45,11 @@ def assets(
     prepare()
     names: Sequence[ObjectSet] = (object_set,) if object_set else _object_sets(object_dir)
     for name in names:
-        bank, refusals = _load_objects(object_dir, name)
+        loaded = _load_objects(object_dir, name)
         file = png if len(names) == 1 else png.with_stem(f"{png.stem}-{name}")
-        print(f"{name} ({object_dir or 'built in'})\n{format_table(bank, refusals)}")
-        if bank.names:
-            _write_image(file, contact_sheet(bank))
+        print(f"{name} ({object_dir or 'built in'})\n{format_table(loaded)}")
+        if loaded.bank.names:
+            _write_image(file, contact_sheet(loaded.bank))
 
 
 def compare(a: Path, b: Path, /, *, json: Path | None = None) -> None:
@@ -153,8 +153,8 @@ def _object_sets(object_dir: Path | None) -> list[ObjectSet]:
     return both if object_dir is None else [name for name in both if (object_dir / name).is_dir()] or ["seen"]
 
 
-def _load_objects(object_dir: Path | None, object_set: ObjectSet) -> tuple[HullBank, list[Refusal]]:
-    return (builtin_bank(object_set), []) if object_dir is None else load_object_dir(object_dir, object_set)
+def _load_objects(object_dir: Path | None, object_set: ObjectSet) -> LoadedDir:
+    return LoadedDir(builtin_bank(object_set)) if object_dir is None else load_object_dir(object_dir, object_set)
 
 
 def _write_image(path: Path, image: np.ndarray) -> None:

@@ -71,7 +71,8 @@ def contact_sheet(bank: HullBank, *, columns: int = 6) -> np.ndarray:
         hulls = object_hulls(bank, jnp.array([index]), pose)
         points = np.asarray(hulls.vertices)[np.asarray(hulls.present)].reshape(-1, 3)
         wide, deep, high = np.ptp(points, axis=0)
-        view = look_at((0.25, -0.62, 0.42), (0.0, 0.0, 0.115), fovy=np.deg2rad(27.0), shape=(220, 220))
+        # Wide enough for the tallest and widest objects that are taken, whichever way they are turned.
+        view = look_at((0.25, -0.62, 0.42), (0.0, 0.0, 0.14), fovy=np.deg2rad(35.0), shape=(220, 220))
         image = draw_camera(hulls, camera=view)
         eligible = "target or obstacle" if bool(np.asarray(bank.eligible)[index]) else "obstacle only"
         size = f"{wide * 100:.1f} x {deep * 100:.1f} x {high * 100:.1f} cm"
