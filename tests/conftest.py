@@ -17,7 +17,7 @@ import pytest
 MAX_MB = 2000
 """Resident memory that a worker may ever have: four of them, and what they start, fit into 16 GB."""
 
-LARGE_MB = 1000
+LARGE_MB = 800
 """Resident memory above which compiled programs are dropped after every test, not only after every module."""
 
 PEAK = pytest.StashKey[int]()

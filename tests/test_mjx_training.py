@@ -35,10 +35,13 @@ FEW = SceneConfig(min_objects=2, max_objects=NUM_SLOTS, train_scenes=4)
 
 
 class Training(NamedTuple):
-    """A program, its iteration compiled, how often a push was traced, and the state before and after the first two."""
+    """A compiled iteration, what it calls on the host, how often a push was traced, and the state before and after two.
 
-    built: program.Program
+    `host_calls` belongs to a test of its own, but is found while the trace is at hand, which takes longest.
+    """
+
     iterate: Any
+    host_calls: list[str]
     traces: list[int]
     before: program.TrainState
     after: program.TrainState
@@ -70,6 +73,17 @@ def make_program(env: Env) -> program.Program:
     return program.make_program(env, config, q_function=q_function)
 
 
+def host_calls(built: program.Program, *platforms: str) -> list[str]:
+    """Return what the iterations of a program call on the host when they are lowered for all of some platforms."""
+    # Without weak types, as `compile` does: the trace of a push is then that of `shapes`.
+    state = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), built.shapes())
+    due = (jax.ShapeDtypeStruct((2,), dtype) for dtype in (jnp.int32, jnp.float32))
+    traced = jax.jit(program.make_iterate(built), donate_argnums=0).trace(state, *due)
+    text = traced.lower(lowering_platforms=platforms).as_text()
+    assert len(re.findall(r"stablehlo\.while", text)) > 1, "the loops over iterations and physics steps are in it"
+    return re.findall(r"custom_call @\w*callback\w*|stablehlo\.(?:send|recv)\b", text)
+
+
 @pytest.fixture(scope="module")
 def training() -> Training:
     traces = []
@@ -81,7 +95,7 @@ def training() -> Training:
     after = iterate(donated, np.array([0, 2], np.int32), np.full(2, 0.4, np.float32))
     assert donated.actors.env_states.physics.qpos.is_deleted()
     assert donated.learning.replay.observations.height.is_deleted()
-    return Training(built, iterate, traces, before, after)
+    return Training(iterate, host_calls(built, "cuda", "tpu"), traces, before, after)
 
 
 def test_two_iterations_push_remember_and_update(training):
@@ -122,17 +136,8 @@ def test_a_push_is_traced_once(training):
     assert len(training.traces) == 1
 
 
-def host_calls(built: program.Program, *platforms: str) -> list[str]:
-    """Return what the iterations of a program call on the host when they are lowered for all of some platforms."""
-    due = (jax.ShapeDtypeStruct((2,), dtype) for dtype in (jnp.int32, jnp.float32))
-    traced = jax.jit(program.make_iterate(built), donate_argnums=0).trace(built.shapes(), *due)
-    text = traced.lower(lowering_platforms=platforms).as_text()
-    assert len(re.findall(r"stablehlo\.while", text)) > 1, "the loops over iterations and physics steps are in it"
-    return re.findall(r"custom_call @\w*callback\w*|stablehlo\.(?:send|recv)\b", text)
-
-
 def test_the_iteration_stays_on_an_accelerator(training):
-    assert host_calls(training.built, "cuda", "tpu") == []
+    assert training.host_calls == []
 
 
 def test_with_the_native_engine_it_does_not():
