@@ -74,14 +74,14 @@ DECOMPOSED = unicodedata.normalize("NFD", COMPOSED)
 def test_names_match_in_either_unicode_form(tmp_path, written, on_disk):
     shutil.copy(CASES / "silent" / "box.stl", tmp_path / on_disk)
     (tmp_path / "objects.yaml").write_text(f"{written}: {{mass: 0.8}}", encoding="utf-8")
-    jobs, refusals = meshes._list_jobs(tmp_path)
+    jobs, refusals, _ = meshes._list_jobs(tmp_path)
     assert [(job.name, job.settings.mass) for job in jobs] == [(Path(COMPOSED).stem, 0.8)] and not refusals
 
 
 def test_one_name_in_two_unicode_forms_is_refused(tmp_path):
     for name in (COMPOSED, DECOMPOSED):
         shutil.copy(CASES / "silent" / "box.stl", tmp_path / name)
-    jobs, refusals = meshes._list_jobs(tmp_path)
+    jobs, refusals, _ = meshes._list_jobs(tmp_path)
     assert (
         not jobs
         and [reason for _, reason in refusals]
