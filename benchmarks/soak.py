@@ -25,8 +25,8 @@ import numpy as np
 from pregrasp_jax.config import PRESETS, Config
 from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.startup import prepare
 from pregrasp_jax.training import collect
-from pregrasp_jax.machine import enable_compilation_cache
 from pregrasp_jax.types import EnvState
 
 MIN_HEIGHT = -0.01
@@ -98,7 +98,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=16, help="scenes side by side")
     parser.add_argument("--scenes-packed", type=int, default=512, help="scenes in the bank that resets draw from")
     arguments = parser.parse_args()
-    enable_compilation_cache()
+    prepare()
     preset = PRESETS["cpu"]
     config = dataclasses.replace(
         preset,

@@ -6,6 +6,7 @@ the program, so that a value out of range is one line before anything compiles.
 
 import dataclasses
 import operator
+import os
 import types
 import typing
 from collections.abc import Mapping
@@ -23,7 +24,7 @@ class AssetsConfig:
     """Which objects."""
 
     object_dir: str | None = None
-    """Folder of .obj/.stl/.ply/.glb meshes (DIR/seen and DIR/unseen if present); None is the built-in catalogue."""
+    """Folder of meshes, see docs/meshes.md (DIR/seen and DIR/unseen if present); None is the built-in catalogue."""
     object_set: ObjectSet = "seen"
     """Training uses `seen`; `unseen` holds objects kept for evaluation (Sec. IV-A)."""
 
@@ -384,6 +385,14 @@ def _checked(value: Any, hint: Any, key: str) -> Any:
         names = " or ".join("null" if t is type(None) else t.__name__ for t in allowed)
         raise ValueError(f"{key} = {value!r} has the wrong type; allowed: {names}")
     return value
+
+
+def with_absolute_paths(config: Config) -> Config:
+    """Return a config whose folders mean the same from any working directory."""
+    folder = config.assets.object_dir
+    if folder is None:
+        return config
+    return dataclasses.replace(config, assets=dataclasses.replace(config.assets, object_dir=os.path.abspath(folder)))
 
 
 def difference(old: Config, new: Config) -> list[str]:

@@ -1,12 +1,13 @@
 """Files that are whole or absent, and hashes that say what made them. No other module of the package is needed."""
 
+import contextlib
 import hashlib
 import json
 import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO, TextIO, cast
 
 import numpy as np
 
@@ -14,10 +15,33 @@ PARTIAL = ".partial"
 """Ending of files that are being written."""
 
 
+CACHE = "PREGRASP_JAX_CACHE"
+"""Environment variable that names the folder of rebuildable files."""
+
+
 def cache_dir() -> Path:
-    """Return the folder of rebuildable files: ``$PREGRASP_JAX_CACHE``, or ``pregrasp_jax`` in the user's cache."""
-    default = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pregrasp_jax"
-    return Path(os.environ.get("PREGRASP_JAX_CACHE") or default)
+    """Return the folder of rebuildable files: ``$PREGRASP_JAX_CACHE``, or ``pregrasp_jax`` in the user's cache.
+
+    Raises:
+        ValueError: neither is known; a container's user may have no home.
+    """
+    if folder := os.environ.get(CACHE):
+        return Path(folder)
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pregrasp_jax"
+    except RuntimeError:
+        raise ValueError(
+            f"this user has no home folder that could hold a cache; allowed is to set {CACHE} to a folder that can be "
+            "written"
+        ) from None
+
+
+def refuse_unwritable_cache(path: Path) -> None:
+    """Do as `refuse_unwritable`, for a file in the cache: there is another place for that."""
+    try:
+        refuse_unwritable(path)
+    except ValueError as error:
+        raise ValueError(f"{error}; {CACHE} names another folder for the cache") from None
 
 
 def mjcf_dir() -> Path:
@@ -40,9 +64,31 @@ def refuse_unwritable(path: Path) -> None:
     Raises:
         ValueError: its folder, or the nearest one that exists, does not allow writing.
     """
-    folder = next(parent for parent in path.absolute().parents if parent.exists())
-    if not (folder.is_dir() and os.access(folder, os.W_OK)):
+    if not is_writable(path):
+        folder = _existing_parent(path)
         raise ValueError(f"{path} cannot be written: {folder} is not a writable folder; allowed is one that is")
+
+
+def is_writable(path: Path) -> bool:
+    """Return whether a file or folder could be made: its folder, or the nearest one that exists, allows writing."""
+    folder = _existing_parent(path)
+    return folder.is_dir() and os.access(folder, os.W_OK)
+
+
+def refuse_ending(path: Path, endings: tuple[str, ...]) -> None:
+    """Refuse a name whose ending promises something else than what would be written.
+
+    Raises:
+        ValueError: it has none of `endings`, in small letters or in capitals.
+    """
+    if path.suffix.lower() not in endings:
+        raise ValueError(f"{path}: nothing can be written under this ending; allowed are {', '.join(endings)}")
+
+
+def discard(stream: TextIO) -> None:
+    """Let a stream whose reader has gone lead nowhere, so that what it still holds cannot fail either."""
+    with contextlib.suppress(OSError, ValueError):  # not a stream of the system
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -101,3 +147,7 @@ def content_hash(*parts: Any) -> str:
         else:
             digest.update(json.dumps(part, sort_keys=True).encode())
     return digest.hexdigest()[:16]
+
+
+def _existing_parent(path: Path) -> Path:
+    return next(parent for parent in path.absolute().parents if parent.exists())

@@ -1,20 +1,12 @@
-"""What this machine is and keeps: versions, written beside every result, and compiled programs."""
+"""What is written beside every result: the versions that made it; and how long it took to compile."""
 
 import contextlib
 import importlib.metadata
-import os
 import platform
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
-
-import jax
 
 import pregrasp_jax
-from pregrasp_jax import io
-
-CACHE_SWITCH = "PREGRASP_JAX_COMPILATION_CACHE"
-"""Environment variable: 0 turns the compilation cache off, wherever it is."""
 
 _PACKAGES = ("mujoco", "mujoco-mjx", "jax", "jaxlib", "flax", "optax", "numpy")
 """Packages that can change a number."""
@@ -29,23 +21,6 @@ def versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             found[package] = "absent"
     return found
-
-
-def compilation_cache_dir() -> Path | None:
-    """Return where compiled programs are kept: the user's own choice for jax, or the cache folder; None if nowhere."""
-    if os.environ.get(CACHE_SWITCH) == "0":
-        return None
-    return Path(jax.config.values["jax_compilation_cache_dir"] or io.cache_dir() / "jax")
-
-
-def enable_compilation_cache() -> None:
-    """Keep compiled programs in `compilation_cache_dir`."""
-    folder = compilation_cache_dir()
-    if folder is None:
-        jax.config.update("jax_enable_compilation_cache", False)
-    elif not jax.config.values["jax_compilation_cache_dir"]:
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 
 @contextlib.contextmanager

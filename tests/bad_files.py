@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import logging
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -16,7 +18,7 @@ from trimesh.exchange.obj import export_obj
 
 from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
-from pregrasp_jax.assets.mesh_file import MAX_BYTES
+from pregrasp_jax.assets.formats import MAX_BYTES
 from pregrasp_jax.checkpoint import Ring, save, save_policy, trees, write_config
 from pregrasp_jax.config import PRESETS, ReplayConfig, TaskConfig
 from pregrasp_jax.training.dump import make_dump
@@ -24,6 +26,24 @@ from pregrasp_jax.training.mishap import no_mishap
 
 FAKE_HASHES = {"hull bank": "hulls", "training scenes": "scenes", "validation scenes": "scenes"}
 """Of the world without physics."""
+
+
+class InlineExecutor:
+    """Decomposes in this process: to start one that imports everything takes longer than all of these tests."""
+
+    def __init__(self, *_: Any, **__: Any):
+        pass
+
+    def __enter__(self) -> "InlineExecutor":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        logging.disable(logging.NOTSET)  # a worker silences itself for good
+
+    def submit(self, function: Any, *arguments: Any) -> Future:
+        future: Future = Future()
+        future.set_result(function(*arguments))
+        return future
 
 
 def make_bad_files(folder: Path) -> None:

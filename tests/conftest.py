@@ -1,13 +1,26 @@
-"""Settings and fixtures that every test shares."""
+"""Settings and fixtures that every test shares, and the memory that a worker may take."""
 
 import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
 
 # isort: split
+import ctypes
+import gc
 import os
+import resource
+import sys
+from collections.abc import Generator
 from pathlib import Path
 
 import jax
 import pytest
+
+MAX_MB = 2000
+"""Resident memory that a worker may ever have: four of them, and what they start, fit into 16 GB."""
+
+LARGE_MB = 800
+"""Resident memory above which compiled programs are dropped after every test, not only after every module."""
+
+PEAK = pytest.StashKey[int]()
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update(
@@ -20,3 +33,40 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 @pytest.fixture
 def key() -> jax.Array:
     return jax.random.key(0)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None]:
+    """Drop compiled programs once fixtures are gone, and fail the test with which the worker outgrew its limit."""
+    yield
+    if nextitem is None or nextitem.path != item.path or resident_mb() > LARGE_MB:
+        drop_compiled_programs()
+    before, peak = item.config.stash.get(PEAK, 0), peak_mb()
+    item.config.stash[PEAK] = peak
+    if before <= MAX_MB < peak and not item.get_closest_marker("slow"):
+        pytest.fail(
+            f"this test took the worker from {before} to {peak} MB of memory; allowed are {MAX_MB}", pytrace=False
+        )
+
+
+def drop_compiled_programs() -> None:
+    """Free what jax has compiled, which otherwise lives as long as the worker: more than 4 GB in the end."""
+    jax.clear_caches()
+    gc.collect()
+    if sys.platform == "linux":  # glibc keeps what was freed until it is told
+        getattr(ctypes.CDLL(None), "malloc_trim", lambda _: 0)(0)
+
+
+def resident_mb() -> int:
+    """Return the resident memory of this process, MB; its peak where there is no /proc."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return peak_mb()
+    return pages * resource.getpagesize() // 2**20
+
+
+def peak_mb() -> int:
+    """Return the largest resident memory that this process has had, MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak // (2**20 if sys.platform == "darwin" else 2**10)

@@ -73,7 +73,13 @@ def test_principal_axes_rebuild_the_inertia_of_muJoCo(bank):
 def test_eligibility_and_its_reason(bank):
     np.testing.assert_array_equal(bank.eligible, [True, False, True])
     assert ineligibility(bank, 0) == ""
-    assert "narrowest width 120 mm, must be < 105" in ineligibility(bank, 1)
+    assert "narrowest width 120.0 mm, must be < 105" in ineligibility(bank, 1)
+
+
+@pytest.mark.parametrize(("coverage", "said"), [(0.96999, "0.969"), (0.9651, "0.965"), (0.5, "0.500")])
+def test_rounding_does_not_hide_why_a_coverage_is_too_small(bank, coverage, said):
+    changed = bank.replace(best_coverage=np.array([coverage] * 3, np.float32))
+    assert ineligibility(changed, 0) == f"best coverage {said}, must be > 0.97"
 
 
 def test_select_keeps_every_field_of_the_object_together(bank):

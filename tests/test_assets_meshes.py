@@ -2,18 +2,24 @@
 
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from bad_files import InlineExecutor
+from mesh_cases import float_document, glb, with_uri
 
 from pregrasp_jax.assets import mesh_file, meshes
+from pregrasp_jax.assets.bank import select
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.decompose import BASE_BAND, decompose, flatten_base, repair
+from pregrasp_jax.assets.fit import Fit
+from pregrasp_jax.assets.folder import find_meshes
 from pregrasp_jax.assets.hulls import volume
 from pregrasp_jax.assets.mesh_file import load_mesh
-from pregrasp_jax.assets.meshes import Refusal, load_object_dir
+from pregrasp_jax.assets.meshes import LoadedDir, Note, Refusal, load_object_dir
 from pregrasp_jax.assets.sets import format_table, load_bank_for
 from pregrasp_jax.assets.settings import ObjectSettings, load_settings
 
@@ -70,8 +76,10 @@ def mixed(tmp_path_factory):
     calls: list[tuple[int, int, str]] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PREGRASP_JAX_CACHE", str(tmp_path_factory.mktemp("cache")))
-        bank, refusals = load_object_dir(folder, "seen", progress=lambda *call: calls.append(call))
-    return bank, {r.name: r.reason for r in refusals}, calls
+        loaded = load_object_dir(folder, "seen", progress=lambda *call: calls.append(call))
+    assert loaded.unused == ["notes.txt: no meshes"]
+    assert set(loaded.fits) == set(loaded.bank.names)
+    return loaded.bank, {r.name: r.reason for r in loaded.refusals}, calls
 
 
 def test_good_meshes_load_beside_bad_ones(mixed):
@@ -109,18 +117,110 @@ def test_up_axis_is_a_proper_rotation(tmp_path, up):
 def test_cache_is_used_and_depends_on_content_settings_and_health(tmp_path, cache, monkeypatch):
     folder = tmp_path / "set"
     write(folder / "one.stl", box())
-    first, _ = load_object_dir(folder, "seen")
+    first = load_object_dir(folder, "seen")
     (entry,) = cache.iterdir()
     with monkeypatch.context() as patch:
         patch.setattr(meshes, "ProcessPoolExecutor", None)  # a second decomposition would fail
-        again, _ = load_object_dir(folder, "seen")
-    assert again.content_hash == first.content_hash
+        again = load_object_dir(folder, "seen")
+    assert again.bank.content_hash == first.bank.content_hash
+    assert again.fits["one"].as_numbers() == first.fits["one"].as_numbers()
     entry.write_bytes(entry.read_bytes()[:-200])
     with pytest.warns(UserWarning, match=rf"{entry.name} is damaged; one\.stl is decomposed anew"):
-        assert load_object_dir(folder, "seen")[0].content_hash == first.content_hash
+        assert load_object_dir(folder, "seen").bank.content_hash == first.bank.content_hash
     (folder / "objects.yaml").write_text("one.stl: {mass: 0.4}")
-    assert float(load_object_dir(folder, "seen")[0].mass[0]) == pytest.approx(0.4)
+    assert float(load_object_dir(folder, "seen").bank.mass[0]) == pytest.approx(0.4)
     assert len(list(cache.iterdir())) == 2
+
+
+def test_cache_depends_on_the_buffers_of_a_gltf(tmp_path, monkeypatch):
+    monkeypatch.setattr(meshes, "WorkerPool", InlineExecutor)
+    document, buffer = with_uri("m.bin")
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "m.gltf").write_bytes(document)
+    heights = []
+    for scale in (1.0, 1.2):
+        corners = np.frombuffer(buffer[:96], "<f4") * np.float32(scale)
+        (tmp_path / "set" / "m.bin").write_bytes(corners.tobytes() + buffer[96:])
+        loaded = load_object_dir(tmp_path / "set", "seen")
+        assert loaded.unused == []
+        heights.append(float(loaded.bank.height[0]))
+    np.testing.assert_allclose(heights, [0.15, 0.18], atol=1e-6)
+    (tmp_path / "set" / "m.bin").unlink()
+    assert (
+        load_object_dir(tmp_path / "set", "seen")
+        .refusals[0]
+        .reason.startswith("its buffer 'm.bin' is missing; allowed")
+    )
+
+
+def test_a_format_whose_library_is_missing_says_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(meshes, "WorkerPool", InlineExecutor)
+    monkeypatch.setitem(sys.modules, "collada", None)
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "m.dae").write_bytes(b"<?xml version='1.0'?><COLLADA/>")
+    (refusal,) = load_object_dir(tmp_path / "set", "seen").refusals
+    assert "the format .dae requires collada; install it with pip install 'pregrasp_jax[formats]'" in refusal.reason
+
+
+def test_a_folder_for_each_object(tmp_path, monkeypatch):
+    """As YCB, Gazebo and pybullet ship them: the original mesh, unless objects.yaml names another one."""
+    monkeypatch.setattr(meshes, "WorkerPool", InlineExecutor)
+    for name in (
+        "003_box/google_16k/textured.obj",
+        "003_box/google_16k/nontextured.stl",
+        "004_can/vhacd.obj",
+    ):
+        write(tmp_path / "set" / name, box())
+    write(tmp_path / "set" / "004_can/meshes/visual.ply", box(height=0.2))
+    write(tmp_path / "set" / "mug.stl", box(height=0.13))
+    write(tmp_path / "set" / "mug/mug.stl", box(height=0.14))
+    for name in (
+        "003_box/google_16k/textured.mtl",
+        "003_box/google_16k/map.png",
+        "004_can/model.urdf",
+        "004_can/a.mtl",
+    ):
+        (tmp_path / "set" / name).write_text("")
+    (tmp_path / "set" / "mug/textured.mtl").write_text("")
+    (tmp_path / "set" / "empty").mkdir()
+    (tmp_path / "set" / "teapot.fbx").write_text("")
+    (tmp_path / "set" / "objects.yaml").write_text("003_box: {mass: 0.4}\n004_can/vhacd.obj: {mass: 0.2}\nmug.stl:\n")
+    loaded = load_object_dir(tmp_path / "set", "seen")
+    assert loaded.bank.names == ("003_box", "004_can", "mug.stl", "mug/mug.stl")
+    np.testing.assert_allclose(loaded.bank.mass[:2], [0.4, 0.2])
+    np.testing.assert_allclose(loaded.bank.height, [0.15, 0.15, 0.13, 0.14], atol=1e-6)
+    assert loaded.refusals[0].name == "teapot.fbx"
+    assert loaded.refusals[0].reason.startswith(
+        ".fbx is not read; allowed are .obj, .stl, .ply, .glb, .gltf, .off, .dae"
+    )
+    assert loaded.unused == [
+        "nontextured.stl, visual.ply: one mesh a folder is read; another one listed in objects.yaml is read instead",
+        "empty: empty folders",
+        "map.png, textured.mtl (2 times), a.mtl: materials and textures; only shapes are read",
+        "model.urdf: descriptions; scale, up, mass and friction are set in objects.yaml",
+    ]
+
+
+def test_the_original_is_read_before_what_was_simplified(tmp_path):
+    for name in ("can/model.obj", "can/a_collision_0.obj", "can/z/model.stl"):
+        write(tmp_path / "set" / name, box())
+    (found,) = find_meshes(tmp_path / "set", ()).meshes
+    assert (found.name, found.key) == ("can", "can/model.obj")
+
+
+def test_meshes_beside_the_folders_of_the_sets_are_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(meshes, "WorkerPool", InlineExecutor)
+    write(tmp_path / "set" / "seen" / "a.stl", box())
+    write(tmp_path / "set" / "stray.stl", box())
+    assert load_object_dir(tmp_path / "set", "seen").unused == [
+        "stray.stl: beside the folder seen, whose meshes are read"
+    ]
+
+
+def test_a_set_up_axis_is_not_doubted(tmp_path):
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "m.glb").write_bytes(glb(*float_document()))
+    assert "doubt" not in load_mesh(tmp_path / "set" / "m.glb", ObjectSettings(up="z")).metadata
 
 
 def test_an_unreadable_mesh_costs_one_mesh(tmp_path, monkeypatch):
@@ -135,7 +235,7 @@ def test_an_unreadable_mesh_costs_one_mesh(tmp_path, monkeypatch):
         return read_bytes(path)
 
     monkeypatch.setattr(Path, "read_bytes", refuse_bad)
-    bank, refusals = load_object_dir(tmp_path, "seen")
+    bank, refusals, *_ = load_object_dir(tmp_path, "seen")
     assert bank.names == ("good",)
     assert refusals == [Refusal("bad.stl", "cannot be read (Permission denied); allowed are readable files")]
 
@@ -144,7 +244,7 @@ def test_a_crashing_decomposition_costs_one_mesh(tmp_path, monkeypatch):
     for name in ("bad", "good", "other"):
         write(tmp_path / f"{name}.stl", box())
     monkeypatch.setattr(meshes, "_try_job", crash_on_bad)
-    bank, refusals = load_object_dir(tmp_path, "seen")
+    bank, refusals, *_ = load_object_dir(tmp_path, "seen")
     assert bank.names == ("good", "other")
     assert [r.name for r in refusals] == ["bad.stl"]
     assert "worker process died" in refusals[0].reason
@@ -170,8 +270,8 @@ def test_sets_and_folders(tmp_path):
         ("a.stl: {mass: 1, density: 300}", "both mass and density"),
         ("a.stl: [1, 2]", "is list; allowed is a mapping"),
         ("- a", "is list; allowed is a mapping"),
-        ("a: {b", "not valid YAML"),
-        ("a.stl: !!python/object/apply:os.getcwd []", "not valid YAML"),
+        ("a: {b", "line 1: while parsing a flow mapping"),
+        ("a.stl: !!python/object/apply:os.getcwd []", "line 1: could not determine a constructor"),
     ],
 )
 def test_wrong_settings_are_one_line(tmp_path, text, message):
@@ -200,7 +300,7 @@ def test_what_is_refused_of_a_usable_set_is_a_warning(tmp_path):
 
 def test_table_names_objects_and_refusals():
     bank = builtin_bank("seen")
-    table = format_table(bank, [Refusal("x.stl", "too low")]).splitlines()
+    table = format_table(LoadedDir(bank, [Refusal("x.stl", "too low")])).splitlines()
     assert table[0].split() == ["object", "hulls", "size", "[mm]", "mass", "[kg]", "target"]
     chips = next(line for line in table if line.startswith("ycb_chips_can"))
     assert chips.split()[1:] == ["1", "77", "x", "76", "x", "250", "0.205", "yes"]
@@ -208,6 +308,26 @@ def test_table_names_objects_and_refusals():
     assert "no: narrowest width" in pitcher
     assert table[-2].startswith("17 objects, ")
     assert table[-1] == "refused: x.stl: too low"
+
+
+def test_table_tells_how_hulls_fit_and_what_is_not_used():
+    bank = select(builtin_bank("seen"), [0, 1])
+    size = np.array([0.06, 0.06, 0.1])
+    fits = {
+        "a": Fit(size, size + 0.002, 1.1, 0.1),
+        "b": Fit(size, size, 0.96, 0.1),
+        "c": Fit(size, size, np.nan, np.nan),
+    }
+    loaded = LoadedDir(
+        bank, notes=[Note("a.stl", fits["a"].remark())], fits=fits, unused=["a.mtl: only shapes are read"]
+    )
+    table = format_table(loaded).splitlines()
+    said = (
+        "hulls against meshes: extents differ by 0.0 mm (median) to 2.0 mm (a), volumes by 7.0 % (median) to 10.0 % (a)"
+    )
+    assert table[-3] == said
+    assert table[-2] == "note: a.stl: hulls 62 x 62 x 102 mm, mesh 60 x 60 x 100 mm; volume 1.10 x that of the mesh"
+    assert table[-1] == "not used: a.mtl: only shapes are read"
 
 
 def test_repair_merges_seams_fills_holes_and_turns_inside_out_faces():
@@ -263,7 +383,7 @@ def test_flatten_base_moves_only_the_band():
 def test_a_folder_of_real_meshes(tmp_path):
     folder = meshes.mesh_folder(Path(os.environ["PREGRASP_JAX_OBJECTS"]), "seen")
     shutil.copytree(folder, tmp_path / "seen")
-    bank, refusals = load_object_dir(tmp_path, "seen")
+    bank, refusals, *_ = load_object_dir(tmp_path, "seen")
     assert not refusals
     assert np.asarray(bank.eligible).mean() > 0.8
     assert min(meshes.tip_angle(bank, i) for i in range(len(bank.names))) > meshes.MIN_TIP_ANGLE

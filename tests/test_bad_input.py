@@ -2,9 +2,7 @@
 nothing written.
 """
 
-import logging
 import os
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,7 @@ import fake_training
 import numpy as np
 import pytest
 import trimesh
-from bad_files import make_bad_files
+from bad_files import InlineExecutor, make_bad_files
 
 from pregrasp_jax.assets import decompose, mesh_file, meshes
 from pregrasp_jax.assets.settings import ObjectSettings
@@ -202,7 +200,7 @@ DUMPS = [
 ]
 
 MESHES = {
-    "nothing": "{f}: holds no mesh; allowed are .obj, .stl, .ply, .glb files",
+    "nothing": "{f}: holds no mesh; allowed are .obj, .stl, .ply, .glb, .gltf, .off, .dae files",
     "flat": "m.stl: flat: 50 x 4 x 150 mm; allowed is at least 10 mm",
     "millimetres": "m.stl: wrong unit: 6e+04 x 7e+04 x 1.5e+05 mm, allowed are 0.01 to 1 m; set scale: 0.001",
     "kilometres": "set scale: 1000 if the file is in kilometres",
@@ -211,8 +209,8 @@ MESHES = {
     "wide": "m.stl: too wide: 210 x 50 x 150 mm; allowed is a width up to 0.2 m",
     "slanted": "m.stl: does not stand: tips over at",
     "nan": "vertices are NaN or infinite; allowed are finite",
-    "empty": "m.ply: not a readable .ply file",
-    "points": "m.obj: empty: 0 vertices and no faces; allowed is a triangle mesh",
+    "empty": "m.ply: empty file; allowed is a triangle mesh",
+    "points": "m.obj: a point cloud of 3 points without faces; allowed is a triangle mesh",
     "sheet": "m.obj: encloses no volume; allowed is the surface of a solid",
     "noise": "m.stl: not a readable .stl file",
     "folder": "m.obj: missing or not a file; allowed are files inside the folder",
@@ -228,7 +226,7 @@ MESHES = {
 }
 TRAIN_ON = "train ci --run-dir {w}/new --assets.object-dir "
 OBJECTS = [
-    (TRAIN_ON + "{w}/nothing", "{w}/nothing: no such folder; allowed is a folder of .obj, .stl, .ply, .glb files"),
+    (TRAIN_ON + "{w}/nothing", "{w}/nothing: no such folder; allowed is a folder of .obj, .stl"),
     (
         "evaluate --policy clear --object-set unseen --object-dir {w}/meshes/flat",
         "has no 'unseen' set; allowed here are",
@@ -253,24 +251,6 @@ HINTS = (
 """How a line goes on that says what would do."""
 
 
-class InlineExecutor:
-    """Decomposes in this process: to start one that imports everything takes longer than all of these tests."""
-
-    def __init__(self, *_: Any, **__: Any):
-        pass
-
-    def __enter__(self) -> "InlineExecutor":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        logging.disable(logging.NOTSET)  # a worker silences itself for good
-
-    def submit(self, function: Any, *arguments: Any) -> Future:
-        future: Future = Future()
-        future.set_result(function(*arguments))
-        return future
-
-
 @pytest.fixture(scope="module")
 def world(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("world")
@@ -290,7 +270,7 @@ def refusal(world, tmp_path, monkeypatch, capsys) -> Any:
     }
     for name, fake in fakes.items():
         monkeypatch.setattr(session, name, fake)
-    monkeypatch.setattr(meshes, "ProcessPoolExecutor", InlineExecutor)
+    monkeypatch.setattr(meshes, "WorkerPool", InlineExecutor)
     monkeypatch.setenv("PREGRASP_JAX_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
 
@@ -357,9 +337,10 @@ def test_a_replay_that_does_not_fit_is_refused_before_the_start(refusal, monkeyp
 )
 def test_a_cache_that_cannot_be_written_is_refused_before_the_work(world, refusal, monkeypatch, command_line, file):
     monkeypatch.setenv("PREGRASP_JAX_CACHE", str(world / "file" / "cache"))
-    monkeypatch.setattr(meshes, "ProcessPoolExecutor", None)
+    monkeypatch.setattr(meshes, "WorkerPool", None)
     said = refusal(command_line)
     assert f"error: {world}/file/cache/{file}" in said and f"{world}/file is not a writable folder" in said
+    assert "PREGRASP_JAX_CACHE names another folder for the cache" in said
 
 
 @pytest.mark.parametrize(

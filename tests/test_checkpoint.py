@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pregrasp_jax.checkpoint import chunks, policy, state, trees
+from pregrasp_jax.checkpoint import chunks, policy, read_config, state, trees, write_config
 from pregrasp_jax.checkpoint.chunks import Ring
 from pregrasp_jax.config import PRESETS, Config
 
@@ -239,7 +239,7 @@ def test_policy_round_trip_from_file_folder_and_run(tmp_path):
         assert trees.checksum(loaded.params) == trees.checksum(params)
         assert loaded.config == config and loaded.evaluation["success_rate"] == 0.5
     assert json.loads((tmp_path / "best" / "evaluation.json").read_text())["env_steps"] == 80
-    assert policy.read_config(tmp_path / "best" / "config.yaml") == config
+    assert read_config(tmp_path / "best" / "config.yaml") == config
 
 
 def test_policies_of_the_first_format_still_load(tmp_path):
@@ -268,7 +268,7 @@ def test_every_byte_of_a_policy_matters(tmp_path):
 
 def test_a_run_without_best_policy_gives_its_latest_checkpoint(tmp_path):
     checkpoints = tmp_path / "checkpoints"
-    policy.write_config(tmp_path / "config.yaml", Config())
+    write_config(tmp_path / "config.yaml", Config())
     save(checkpoints, 1, 4)
     flip_byte(save(checkpoints, 2, 9) / "state.safetensors")
     loaded = policy.load_policy(tmp_path)

@@ -17,7 +17,7 @@ from PIL import Image
 from report_files import write_evaluation
 
 import pregrasp_jax
-from pregrasp_jax import io
+from pregrasp_jax import io, startup
 from pregrasp_jax.checkpoint import save_policy
 from pregrasp_jax.cli import commands, doctor, film, player, progress
 from pregrasp_jax.cli import evaluate as evaluate_module
@@ -29,7 +29,7 @@ from pregrasp_jax.evaluation.player import EvaluationConfig, make_player, run_ev
 from pregrasp_jax.learning.networks import QNetwork
 from pregrasp_jax.physics import mjx_version
 from pregrasp_jax.scene.bank import SceneBank
-from pregrasp_jax.training import program, resources
+from pregrasp_jax.training import resources
 
 
 @pytest.fixture
@@ -211,12 +211,12 @@ def test_doctor_names_what_a_bug_report_needs(run: Any) -> None:
 
 def test_the_compilation_cache_has_an_off_switch(monkeypatch: pytest.MonkeyPatch) -> None:
     changed: list[tuple[str, Any]] = []
-    monkeypatch.setattr(program.jax.config, "update", lambda *change: changed.append(change))
-    program.enable_compilation_cache()
+    monkeypatch.setattr(startup.jax.config, "update", lambda *change: changed.append(change))
+    startup.enable_compilation_cache()
     assert not changed, "these tests have chosen a folder, which stays"
     assert dict(doctor.describe())["compiled programs"] == jax.config.values["jax_compilation_cache_dir"]
-    monkeypatch.setenv(program.CACHE_SWITCH, "0")
-    program.enable_compilation_cache()
+    monkeypatch.setenv(startup.CACHE_SWITCH, "0")
+    startup.enable_compilation_cache()
     assert changed == [("jax_enable_compilation_cache", False)], "whatever folder is set"
     assert dict(doctor.describe())["compiled programs"] == "not kept (PREGRASP_JAX_COMPILATION_CACHE=0)"
 

@@ -3,11 +3,12 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from heightmap_oracle import box_cloud, make_instances, pad
 from PIL import Image
 
 from pregrasp_jax import drawing
-from pregrasp_jax.assets.bank import select
+from pregrasp_jax.assets.bank import ConvexObject, make_bank, select
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.drawing import shaded
 from pregrasp_jax.spaces import grid
@@ -114,18 +115,29 @@ def test_contact_sheet_shows_every_object():
         assert color_of(half.astype(float), drawing.OBSTACLE_COLORS[0]).mean() > 0.02
 
 
+def test_contact_sheet_shows_the_tallest_object_whole():
+    """A head that is cut off reaches the upper edge of its picture, where a low object leaves only floor."""
+    tall, low = (
+        np.asarray(trimesh.creation.box((0.2, 0.2, height)).vertices) + np.array([0, 0, height / 2])
+        for height in (0.30, 0.02)
+    )
+    pictures = [drawing.contact_sheet(make_bank([ConvexObject("x", [part])]))[8:228, 8:228] for part in (tall, low)]
+    differs = (pictures[0] != pictures[1]).any(axis=2)
+    assert differs[60:].any() and not differs[:3].any() and not differs[:, :3].any() and not differs[:, -3:].any()
+
+
 def test_files_hold_what_was_drawn(tmp_path):
     frames = [np.full((20, 30, 3), value, np.uint8) for value in (10, 120, 240)]
-    drawing.save_png(tmp_path / "a.png", frames[1])
+    drawing.save_image(tmp_path / "a.png", frames[1])
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), frames[1])
-    drawing.save_gif(tmp_path / "a.gif", frames, seconds_per_frame=0.5)
+    drawing.save_film(tmp_path / "a.gif", frames, seconds_per_frame=0.5)
     movie = Image.open(tmp_path / "a.gif")
     assert getattr(movie, "n_frames", 1) == 3 and movie.info["duration"] == 500 and movie.info["loop"] == 0
     for i, frame in enumerate(frames):
         movie.seek(i)
         assert np.abs(np.asarray(movie.convert("RGB")).astype(int) - frame).max() <= 2
     with pytest.raises(ValueError, match="at least one frame"):
-        drawing.save_gif(tmp_path / "b.gif", [])
+        drawing.save_film(tmp_path / "b.gif", [])
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gif", "a.png"]
 
 

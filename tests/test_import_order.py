@@ -9,8 +9,8 @@ import pregrasp_jax
 
 PACKAGE = Path(pregrasp_jax.__file__).parent
 ORDER = [
-    ["io", "types"],
-    ["config", "geometry", "machine", "spaces"],
+    ["io", "types", "yaml_file"],
+    ["config", "geometry", "machine", "spaces", "startup"],
     ["assets"],
     ["robot"],
     ["scene"],

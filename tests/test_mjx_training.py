@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +18,8 @@ from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import PRESETS, Config, SceneConfig
 from pregrasp_jax.evaluation import Evaluator
 from pregrasp_jax.learning.q_function import QFunction
-from pregrasp_jax.physics import mjx
+from pregrasp_jax.physics import mjx, native
+from pregrasp_jax.physics.base import Engine
 from pregrasp_jax.policies import scripts
 from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene import bank as scene_bank
@@ -33,18 +35,22 @@ FEW = SceneConfig(min_objects=2, max_objects=NUM_SLOTS, train_scenes=4)
 
 
 class Training(NamedTuple):
-    """A compiled iteration, how often a push was traced, and the state before and after the first two."""
+    """A compiled iteration, what it calls on the host, how often a push was traced, and the state before and after two.
+
+    `host_calls` belongs to a test of its own, but is found while the trace is at hand, which takes longest.
+    """
 
     iterate: Any
+    host_calls: list[str]
     traces: list[int]
     before: program.TrainState
     after: program.TrainState
 
 
-def make_env(num_slots: int, scenes: SceneConfig, traces: list[int] | None = None) -> Env:
-    """Return the environment of the ci preset on packed scenes; `traces` notes every trace of a push."""
+def make_env(num_slots: int, scenes: SceneConfig, traces: list[int] | None = None, engine: Engine | None = None) -> Env:
+    """Return the environment of the ci preset on packed scenes, on MJX; `traces` notes every trace of a push."""
     bank = builtin_bank("seen")
-    engine = mjx.make_engine(bank, num_slots=num_slots)
+    engine = engine or mjx.make_engine(bank, num_slots=num_slots)
 
     def counted(state, ctrl, num_ctrl):
         if traces is not None:
@@ -60,13 +66,28 @@ def make_env(num_slots: int, scenes: SceneConfig, traces: list[int] | None = Non
     )
 
 
+def make_program(env: Env) -> program.Program:
+    """Return the program of the ci preset, two iterations in one."""
+    q_function = QFunction(TinyNetwork(), input_fn)  # what is compiled here is long enough without a real one
+    config = dataclasses.replace(PRESETS["ci"], train=dataclasses.replace(PRESETS["ci"].train, fused_iterations=2))
+    return program.make_program(env, config, q_function=q_function)
+
+
+def host_calls(built: program.Program, *platforms: str) -> list[str]:
+    """Return what the iterations of a program call on the host when they are lowered for all of some platforms."""
+    # Without weak types, as `compile` does: the trace of a push is then that of `shapes`.
+    state = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), built.shapes())
+    due = (jax.ShapeDtypeStruct((2,), dtype) for dtype in (jnp.int32, jnp.float32))
+    traced = jax.jit(program.make_iterate(built), donate_argnums=0).trace(state, *due)
+    text = traced.lower(lowering_platforms=platforms).as_text()
+    assert len(re.findall(r"stablehlo\.while", text)) > 1, "the loops over iterations and physics steps are in it"
+    return re.findall(r"custom_call @\w*callback\w*|stablehlo\.(?:send|recv)\b", text)
+
+
 @pytest.fixture(scope="module")
 def training() -> Training:
     traces = []
-    env = make_env(NUM_SLOTS, FEW, traces)
-    q_function = QFunction(TinyNetwork(), input_fn)  # what is compiled here is long enough without a real one
-    config = dataclasses.replace(PRESETS["ci"], train=dataclasses.replace(PRESETS["ci"].train, fused_iterations=2))
-    built = program.make_program(env, config, q_function=q_function)
+    built = make_program(make_env(NUM_SLOTS, FEW, traces))
     before = jax.jit(built.init)(jax.random.key(0))
     iterate = built.compile(before).iterate
     assert iterate is not None
@@ -74,7 +95,7 @@ def training() -> Training:
     after = iterate(donated, np.array([0, 2], np.int32), np.full(2, 0.4, np.float32))
     assert donated.actors.env_states.physics.qpos.is_deleted()
     assert donated.learning.replay.observations.height.is_deleted()
-    return Training(iterate, traces, before, after)
+    return Training(iterate, host_calls(built, "cuda", "tpu"), traces, before, after)
 
 
 def test_two_iterations_push_remember_and_update(training):
@@ -113,6 +134,16 @@ def test_a_scene_that_diverges_ends_alone_is_counted_and_starts_anew(training):
 def test_a_push_is_traced_once(training):
     """For shapes, start and compilation, whatever objects the scenes then have."""
     assert len(training.traces) == 1
+
+
+def test_the_iteration_stays_on_an_accelerator(training):
+    assert training.host_calls == []
+
+
+def test_with_the_native_engine_it_does_not():
+    """So the test above can fail. JAX refuses to lower a callback for a platform that this machine does not have."""
+    engine = native.make_engine(builtin_bank("seen"))
+    assert host_calls(make_program(make_env(NUM_SLOTS, FEW, engine=engine)), "cpu")
 
 
 @pytest.fixture(scope="module")

@@ -44,7 +44,7 @@ def cached(env: Env, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     calls: list[str] = []
     for module in (commands, player):
         monkeypatch.setattr(module, "make_env", lambda *_, **__: env)
-    monkeypatch.setattr(commands, "enable_compilation_cache", lambda: calls.append("kept"))
+        monkeypatch.setattr(module, "prepare", lambda: calls.append("kept"))
     return calls
 
 

@@ -137,7 +137,7 @@ def test_a_line_that_a_crash_cut_is_left_out(run_dir: Path) -> None:
     [
         ("config.yaml", None, "is not a run folder (it has no config.yaml)"),
         ("config.yaml", "- 1\n", "config.yaml: not the settings of a run"),
-        ("config.yaml", "a: [", "config.yaml: while parsing"),
+        ("config.yaml", "a: [", "config.yaml: line 1: while parsing"),
         ("manifest.json", "{", "manifest.json: damaged, not JSON"),
         ("manifest.json", "[]", "manifest.json: damaged, not a JSON object"),
         ("metrics.jsonl", '{"env_steps": 1}\n{"env\n{"env_steps": 2}\n', "metrics.jsonl: line 2 is damaged, not JSON"),

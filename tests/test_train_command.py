@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from pregrasp_jax.checkpoint.run_config import CHANGEABLE
 from pregrasp_jax.cli.command_line import unbox
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.training.run_folder import EXTENDABLE
 
 ROOT = Path(__file__).parent.parent
 
@@ -28,7 +28,7 @@ def test_help_of_resume_names_all_that_may_change(capsys):
     with pytest.raises(SystemExit):
         main(["train", "resume", "--help"])
     text = capsys.readouterr().out.split("may change")[0]
-    assert all(name in text for name in EXTENDABLE)
+    assert all(name in text for name in CHANGEABLE)
 
 
 BOX = """

@@ -1,8 +1,9 @@
 """The hull bank: build it from convex parts, join, select, save and load it."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -93,12 +94,20 @@ def select(bank: HullBank, indices: Sequence[int] | np.ndarray) -> HullBank:
     )
 
 
-def save_bank(path: Path, bank: HullBank) -> None:
-    """Write a bank as npz, whole or not at all."""
+def save_bank(path: Path, bank: HullBank, *, about: Mapping[str, Any] | None = None) -> None:
+    """Write a bank as npz, whole or not at all.
+
+    Args:
+        path: the file.
+        bank: the bank.
+        about: JSON-able remarks that `load_about` returns; they are no part of the bank and of its hash.
+    """
     arrays = {
         f"{level}_{key}": value for level in ("full", "coarse") for key, value in vars(getattr(bank, level)).items()
     }
     arrays |= {key: getattr(bank, key) for key in ("object_hulls", *_PER_OBJECT)}
+    if about is not None:
+        arrays["about"] = np.array(json.dumps(about))
     io.write_npz(
         path,
         format=np.array(FORMAT),
@@ -117,6 +126,7 @@ def load_bank(path: Path) -> HullBank:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
+        arrays.pop("about", None)
         if str(arrays.pop("format")) != FORMAT:
             raise ValueError("format differs")
         recorded = str(arrays.pop("content_hash"))
@@ -134,6 +144,19 @@ def load_bank(path: Path) -> HullBank:
     except Exception as error:
         raise ValueError(f"{path}: not a readable '{FORMAT}' file ({error}); delete it and build it again") from error
     return bank
+
+
+def load_about(path: Path) -> dict[str, Any]:
+    """Return the remarks that a bank was written with; none if there are none.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return json.loads(str(file["about"])) if "about" in file else {}
+    except Exception as error:
+        raise ValueError(f"{path}: not a readable '{FORMAT}' file ({error}); delete it and build it again") from error
 
 
 def _empty() -> HullBank:

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 from pregrasp_jax.assets.hulls import BASE_RING, simplify, volume
 from pregrasp_jax.types import FULL_TOPOLOGY, MAX_HULLS
 
-VERSION = 2
+VERSION = 3
 """Part of every cache key; to be raised whenever the same mesh would give other parts."""
 
 BASE_BAND = 0.004
@@ -79,19 +79,34 @@ def decompose(mesh: trimesh.Trimesh) -> tuple[np.ndarray, ...]:
     if volume(vertices) <= _CONVEX_RATIO[closed] * mesh.volume:
         parts = [vertices]
     elif closed:
-        parts = _cut(mesh, preprocess_mode="auto")
+        parts = cut(mesh, preprocess_mode="auto")
     else:
-        parts = _refit(_cut(mesh, preprocess_mode="on"), mesh)
-    return _solid_parts(flatten_base(parts))
+        parts = refit(cut(mesh, preprocess_mode="on"), mesh)
+    return finish(parts)
 
 
-def _cut(mesh: trimesh.Trimesh, *, preprocess_mode: str) -> list[np.ndarray]:
+def cut(mesh: trimesh.Trimesh, *, preprocess_mode: str) -> list[np.ndarray]:
+    """Let CoACD cut a mesh into raw parts.
+
+    Args:
+        mesh: in m, z up.
+        preprocess_mode: `on` remeshes it first, `auto` only where it is not a manifold.
+    """
     coacd.set_log_level("off")
     found = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), preprocess_mode=preprocess_mode, **_COACD)
     return [vertices for vertices, _ in found]
 
 
-def _refit(parts: list[np.ndarray], mesh: trimesh.Trimesh) -> list[np.ndarray]:
+def finish(parts: list[np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Turn raw parts into those of an object: standing on a flat base, without slivers, simplified.
+
+    Raises:
+        ValueError: nothing has a volume.
+    """
+    return _solid_parts(flatten_base(parts))
+
+
+def refit(parts: list[np.ndarray], mesh: trimesh.Trimesh) -> list[np.ndarray]:
     """Replace every part by the points of the mesh's own surface inside of it.
 
     CoACD makes a broken mesh watertight by remeshing it, which inflates it by up to a millimetre or two.

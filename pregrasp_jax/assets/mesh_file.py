@@ -1,18 +1,15 @@
 """One mesh file: read it safely, check its size, stand it up, repair it."""
 
-import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
 
 from pregrasp_jax.assets.decompose import repair
+from pregrasp_jax.assets.formats import read_files, read_surface
 from pregrasp_jax.assets.settings import SETTINGS_FILE, ObjectSettings
+from pregrasp_jax.assets.standing import doubt
 from pregrasp_jax.spaces.grid import MAX_HEIGHT
-
-SUFFIXES = (".obj", ".stl", ".ply", ".glb")
-"""Formats that are read."""
 
 MIN_OBJECT_HEIGHT = 0.11
 """m; the hand pushes at 0.1 m, lower objects would pass under it."""
@@ -26,59 +23,42 @@ MAX_OBJECT_WIDTH = 0.2
 MIN_OBJECT_WIDTH = 0.01
 """m; thinner objects are flat."""
 
-MAX_BYTES = 256 * 2**20
-"""Largest mesh file; 2 M faces are 100 MB of binary STL."""
-
 _UNITS = (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254), ("kilometres", 1e3))
 
 
 def load_mesh(path: Path, settings: ObjectSettings) -> trimesh.Trimesh:
     """Read one mesh file, check it, and return it repaired, in metres, z up.
 
+    Its metadata says in `doubt` why it may stand on the wrong side, if there is such a reason.
+
     Raises:
         ValueError: one line about what is wrong with it.
     """
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise ValueError(f"file of {size / 2**20:.0f} MB; allowed are {MAX_BYTES // 2**20} MB, decimate it first")
-    mesh = _parse(path.read_bytes(), path.suffix[1:].lower())
-    if len(mesh.faces) == 0:
-        raise ValueError(f"empty: {len(mesh.vertices)} vertices and no faces; allowed is a triangle mesh")
-    used = np.asarray(mesh.vertices, np.float64)[np.unique(mesh.faces)]
+    surface = read_surface(read_files(path), path.suffix.lower())
+    used = surface.vertices[np.unique(surface.faces)]
     bad = int((~np.isfinite(used).all(axis=1)).sum())
     if bad:
         raise ValueError(f"{bad} of {len(used)} vertices are NaN or infinite; allowed are finite coordinates")
-    mesh.vertices = _upright(np.asarray(mesh.vertices, np.float64) * settings.scale, settings.up)
-    _check_size(_upright(used * settings.scale, settings.up), settings)
-    mesh = repair(mesh)
+    said = surface.up if settings.up is None and surface.up != "z" else None
+    hint = f" (by its {path.suffix.lower()} format, {said})" if said else ""
+    _check_size(_upright(used * settings.scale, settings.up), settings, hint)
+    vertices = _upright(surface.vertices * settings.scale, settings.up)
+    mesh = repair(trimesh.Trimesh(vertices, surface.faces, process=False))
     if len(mesh.faces) == 0:
         raise ValueError("all faces are degenerate or duplicates; allowed is a surface that encloses a volume")
+    if settings.up is None:
+        mesh.metadata["doubt"] = doubt(mesh.vertices, mesh.faces, path.suffix.lower(), surface.up)
     return mesh
 
 
-def one_line(error: Exception) -> str:
-    """Return the message of an error on one line."""
-    return " ".join(str(error).split()) or type(error).__name__
-
-
-def _parse(data: bytes, file_type: str) -> trimesh.Trimesh:
-    """Parse from memory, without a resolver: a mesh file cannot make us open another file."""
-    options: dict[str, Any] = {"skip_materials": True} if file_type == "obj" else {}
-    try:
-        scene = trimesh.load_scene(io.BytesIO(data), file_type=file_type, process=False, **options)
-        mesh = scene.to_mesh()
-    except Exception as error:
-        raise ValueError(f"not a readable .{file_type} file: {one_line(error)}") from error
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-
-
-def _upright(vertices: np.ndarray, up: str) -> np.ndarray:
+def _upright(vertices: np.ndarray, up: str | None) -> np.ndarray:
     """Rotate vertices so that the axis `up` becomes z: cyclic for the axis, half a turn about x for its sign."""
+    up = up or "z"
     vertices = np.roll(vertices, 2 - "xyz".index(up[-1]), axis=1)
     return vertices * [1.0, -1.0, -1.0] if up.startswith("-") else vertices
 
 
-def _check_size(vertices: np.ndarray, settings: ObjectSettings) -> None:
+def _check_size(vertices: np.ndarray, settings: ObjectSettings, up_hint: str) -> None:
     """Refuse wrong units, flat objects, and objects outside of what the task can handle."""
     size = np.ptp(vertices, axis=0)
     text = " x ".join(f"{extent * 1e3:.4g}" for extent in size) + " mm"
@@ -95,6 +75,7 @@ def _check_size(vertices: np.ndarray, settings: ObjectSettings) -> None:
     if not MIN_OBJECT_HEIGHT <= size[2] <= MAX_OBJECT_HEIGHT:
         what = "too low" if size[2] < MIN_OBJECT_HEIGHT else "too tall"
         allowed = f"allowed heights are {MIN_OBJECT_HEIGHT:g} to {MAX_OBJECT_HEIGHT:g} m"
-        raise ValueError(f"{what}: {text}, up is {settings.up}; {allowed}, scale and up can be set in {SETTINGS_FILE}")
+        up = f"{settings.up or 'z'}{up_hint}"
+        raise ValueError(f"{what}: {text}, up is {up}; {allowed}, scale and up can be set in {SETTINGS_FILE}")
     if size[:2].max() > MAX_OBJECT_WIDTH:
         raise ValueError(f"too wide: {text}; allowed is a width up to {MAX_OBJECT_WIDTH:g} m")

@@ -4,19 +4,26 @@ The file lies beside the meshes. Its keys are mesh file names, and `defaults` fo
 
     defaults: {density: 300, friction: 0.25}
     mug.stl: {scale: 0.001, up: y, mass: 0.12}
+
+Names are compared in one Unicode form: macOS takes the accents of a file name apart, editors do not.
 """
 
 import math
-from collections.abc import Mapping
+import re
+import unicodedata
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from pregrasp_jax import yaml_file
 from pregrasp_jax.assets.bank import DEFAULT_DENSITY, DEFAULT_FRICTION
 
 SETTINGS_FILE = "objects.yaml"
+
+_MEANT_AS_SETTINGS = re.compile(r"objects?\.(ya?ml|json|toml)(\.txt)?")
+"""Names, in lower case, of files whose writer wanted `SETTINGS_FILE`."""
 
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 
@@ -29,8 +36,8 @@ class ObjectSettings:
 
     scale: float = 1.0
     """Metres per unit of the file; 0.001 for millimetres."""
-    up: str = "z"
-    """The axis of the file that points up when the object stands: x, y, z, -x, -y or -z."""
+    up: str | None = None
+    """The axis of the file that points up when the object stands: x, y, z, -x, -y or -z; None is z, with doubts."""
     mass: float | None = None
     """kg; None is `density` times the volume of the hulls."""
     density: float = DEFAULT_DENSITY
@@ -46,19 +53,51 @@ def load_settings(folder: Path) -> tuple[ObjectSettings, dict[str, ObjectSetting
         The settings of unlisted meshes, and those of every listed file by name.
 
     Raises:
-        ValueError: the file is not YAML, or holds an unknown setting or a value out of range.
+        ValueError: the file is not YAML, names a mesh twice, holds an unknown setting or a value out of range, or lies
+            there under another name.
     """
+    _refuse_misnamed(folder)
     path = folder / SETTINGS_FILE
-    if not path.is_file():
+    if not path.exists():
         return ObjectSettings(), {}
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
+    content = yaml_file.read(path)
     content = _mapping(content, str(path))
     shared = _checked(content.pop("defaults", None), f"{path}: defaults")
-    listed = {str(name): _merged(shared, _checked(entry, f"{path}: {name}")) for name, entry in content.items()}
-    return ObjectSettings(**shared), {name: ObjectSettings(**entry) for name, entry in listed.items()}
+    listed: dict[str, ObjectSettings] = {}
+    for name, entry in content.items():
+        settings = ObjectSettings(**_merged(shared, _checked(entry, f"{path}: {name}")))
+        if listed.setdefault(same_form(str(name)), settings) is not settings:
+            raise ValueError(f"{path}: {name}: stands twice, in two Unicode forms; allowed is one entry")
+    return ObjectSettings(**shared), listed
+
+
+def refuse_beside_sets(folder: Path, sets: Sequence[str]) -> None:
+    """Refuse settings that lie beside the folders `sets`, where they would not be read.
+
+    Raises:
+        ValueError: there are some.
+    """
+    for path in sorted(folder.iterdir()):
+        if _MEANT_AS_SETTINGS.fullmatch(path.name.lower()):
+            places = " and ".join(str(folder / name / SETTINGS_FILE) for name in sets)
+            raise ValueError(f"{path}: not read, since it lies beside {sets[0]}; allowed is {places}")
+
+
+def same_form(name: str) -> str:
+    """Return a file name in the Unicode form in which names are compared (NFC)."""
+    return unicodedata.normalize("NFC", name)
+
+
+def _refuse_misnamed(folder: Path) -> None:
+    """Refuse files that were meant as settings and are not read; warn of other YAML files."""
+    for path in sorted(folder.iterdir()):
+        if path.name == SETTINGS_FILE:
+            if not path.is_file():
+                raise ValueError(f"{path}: missing or not a file; allowed is a file of settings")
+        elif _MEANT_AS_SETTINGS.fullmatch(path.name.lower()):
+            raise ValueError(f"{path}: not read; the allowed name of a file of settings is {SETTINGS_FILE}")
+        elif path.suffix.lower() in (".yaml", ".yml"):
+            warnings.warn(f"{path}: not read; settings of meshes stand in {SETTINGS_FILE}", stacklevel=3)
 
 
 def _merged(shared: dict[str, Any], entry: dict[str, Any]) -> dict[str, Any]:

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint import trees
+from pregrasp_jax.checkpoint.run_config import CONFIG, stored_config, write_config
 from pregrasp_jax.checkpoint.state import read_newest_policy
 from pregrasp_jax.checkpoint.trees import DamagedFileError
 from pregrasp_jax.config import Config, from_dict, to_dict
@@ -56,7 +56,7 @@ def save_policy(folder: Path, params: Any, config: Config, evaluation: dict[str,
     about = {"format": FORMAT, "config": json.dumps(to_dict(config)), "evaluation": json.dumps(evaluation)}
     metadata = about | {"checksum": _checksum(arrays, about)}
     io.write_bytes(folder / _PARAMS, trees.encode(arrays, metadata))
-    write_config(folder / "config.yaml", config)
+    write_config(folder / CONFIG, config)
     io.write_json(folder / "evaluation.json", evaluation)
 
 
@@ -75,28 +75,10 @@ def load_policy(path: Path | str) -> Policy:
                 return _read_policy(candidate)
             except ValueError as error:
                 raise type(error)(f"{error}; allowed: {_ALLOWED}") from None
-    config_file = path / "config.yaml"
-    if config_file.is_file() and (path / "checkpoints").is_dir():
-        return _policy_of_checkpoint(path / "checkpoints", read_config(config_file))
+    if (path / CONFIG).is_file() and (path / "checkpoints").is_dir():
+        return _policy_of_checkpoint(path / "checkpoints", stored_config(path))
     problem = "is neither a run folder nor a policy folder" if path.is_dir() else "does not exist"
     raise ValueError(f"policy {path} {problem}; allowed: {_ALLOWED}")
-
-
-def write_config(path: Path, config: Config) -> None:
-    """Write a config.yaml."""
-    io.write_bytes(path, yaml.safe_dump(to_dict(config), sort_keys=False).encode())
-
-
-def read_config(path: Path) -> Config:
-    """Read a config.yaml.
-
-    Raises:
-        ValueError: not YAML, an unknown key, or a value of the wrong type or out of range.
-    """
-    try:
-        return from_dict(yaml.safe_load(path.read_text())).validate()
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError) as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
 
 
 def _read_policy(path: Path) -> Policy:

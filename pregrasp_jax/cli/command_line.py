@@ -7,10 +7,15 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import TypeVar
 
+from pregrasp_jax import io
+
 T = TypeVar("T")
 
 USAGE_ERROR, INTERRUPTED = 2, 130
 """Exit codes of a command that was asked for something impossible, and of one that Ctrl-C has ended."""
+
+READER_GONE = 128 + 13
+"""The same of one whose reader has gone: what a shell says of a program that SIGPIPE has ended."""
 
 
 def parse(parser: Callable[[], T]) -> T:
@@ -46,10 +51,17 @@ def unbox(text: str) -> str:
 def one_line_errors() -> Iterator[None]:
     """Turn a refusal (ValueError, FileNotFoundError, ...) into one line on standard error and exit code 2.
 
-    Errors of several lines come from libraries, not from this package's checks, and keep their traceback.
+    Errors of several lines come from libraries, not from this package's checks, and keep their traceback. Where the
+    reader of the output has gone (`| head`), the command ends without a word, as others do.
     """
     try:
-        yield
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        io.discard(sys.stdout)
+        sys.exit(READER_GONE)
     except (ValueError, OSError, FloatingPointError) as error:
         if "\n" in str(error):
             raise

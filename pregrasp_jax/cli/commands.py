@@ -9,10 +9,10 @@ import numpy as np
 
 from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
-from pregrasp_jax.assets.meshes import Refusal, load_object_dir
+from pregrasp_jax.assets.meshes import LoadedDir, load_object_dir
 from pregrasp_jax.assets.sets import format_table
 from pregrasp_jax.cli import doctor as machine_doctor
-from pregrasp_jax.cli.evaluate import refuse_unwritable
+from pregrasp_jax.cli.outputs import refuse_unwritable
 from pregrasp_jax.config import (
     AssetsConfig,
     Config,
@@ -22,15 +22,15 @@ from pregrasp_jax.config import (
     TaskConfig,
     TaskOverrides,
 )
-from pregrasp_jax.drawing import contact_sheet, save_png
+from pregrasp_jax.drawing import contact_sheet, save_image
 from pregrasp_jax.evaluation import load_evaluation
 from pregrasp_jax.evaluation.player import make_player
 from pregrasp_jax.evaluation.statistics import compare as compare_evaluations
 from pregrasp_jax.evaluation.statistics import format_comparison
-from pregrasp_jax.machine import enable_compilation_cache
 from pregrasp_jax.report.play import draw_decision, draw_scenes
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene.bank import SceneBank
+from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import make_env
 from pregrasp_jax.types import HullBank
 
@@ -44,20 +44,22 @@ def assets(
     """List the objects of a mesh folder (or the built-in ones): hulls, size, mass, whether they can be targets.
 
     Args:
-        object_dir: folder of .obj/.stl/.ply/.glb meshes, with subfolders seen and unseen or without; the built-in
-            catalogue if left out.
+        object_dir: folder of .obj/.stl/.ply/.glb/.gltf/.off/.dae meshes, or of folders with one each, with
+            subfolders seen and unseen or without; the built-in catalogue if left out.
         object_set: only this set; all that there are if left out.
-        png: contact sheet of the objects; with two sets their names are added to that of the file.
+        png: contact sheet of the objects, .png, .jpg, .jpeg or .webp; with two sets their names are added to that of
+            the file.
     """
-    refuse_unwritable(png)
+    refuse_unwritable(png, "image")
+    prepare()
     names: Sequence[ObjectSet] = (object_set,) if object_set else _object_sets(object_dir)
     for name in names:
-        bank, refusals = _load_objects(object_dir, name)
-        eligible, why_not = get_robot(TaskConfig().robot).eligibility(bank)
+        loaded = _load_objects(object_dir, name)
+        eligible, why_not = get_robot(TaskConfig().robot).eligibility(loaded.bank)
         file = png if len(names) == 1 else png.with_stem(f"{png.stem}-{name}")
-        print(f"{name} ({object_dir or 'built in'})\n{format_table(bank, refusals, why_not)}")
-        if bank.names:
-            _write_png(file, contact_sheet(bank, eligible))
+        print(f"{name} ({object_dir or 'built in'})\n{format_table(loaded, why_not)}")
+        if loaded.bank.names:
+            _write_image(file, contact_sheet(loaded.bank, eligible))
 
 
 def compare(a: Path, b: Path, /, *, json: Path | None = None) -> None:
@@ -68,7 +70,7 @@ def compare(a: Path, b: Path, /, *, json: Path | None = None) -> None:
         b: another, of the same scenes.
         json: write the comparison here.
     """
-    refuse_unwritable(json)
+    refuse_unwritable(json, "json")
     comparison = compare_evaluations(load_evaluation(a), load_evaluation(b))
     print(format_comparison(comparison))
     if json:
@@ -95,15 +97,15 @@ def scenes(
         object_dir: folder of meshes; the built-in catalogue if left out.
         object_set: objects used in training, or kept for evaluation.
         scene: how many scenes, how crowded.
-        png: draw the first scenes here.
+        png: draw the first scenes here; .png, .jpg, .jpeg or .webp.
     """
-    refuse_unwritable(png)
+    refuse_unwritable(png, "image")
+    prepare()
     config = Config(assets=AssetsConfig(object_dir=object_dir, object_set=object_set), scene=scene).validate()
     env = make_env(config, split=split)
     print(describe_scenes(env.scenes, env.bank))
     if png:
-        enable_compilation_cache()
-        _write_png(png, draw_scenes(env, range(min(_SHOWN_SCENES, len(env.scenes)))))
+        _write_image(png, draw_scenes(env, range(min(_SHOWN_SCENES, len(env.scenes)))))
 
 
 def show(
@@ -125,18 +127,17 @@ def show(
         object_dir: folder of meshes; the built-in catalogue if left out.
         object_set: objects used in training, or kept for evaluation.
         camera: what the policy sees through.
-        png: the picture.
+        png: the picture; .png, .jpg, .jpeg or .webp.
     """
-    refuse_unwritable(png)
+    refuse_unwritable(png, "image")
     if pushes < 0:
         raise ValueError(f"pushes = {pushes} is out of range; allowed is 0 and more")
-    enable_compilation_cache()
     assets_config = AssetsConfig(object_dir=object_dir, object_set=object_set)
     task = TaskOverrides(camera=camera)
     player = make_player(EvaluationConfig(policy=policy, assets=assets_config, task=task))
     if not 0 <= scene < len(player.env.scenes):
         raise ValueError(f"scene = {scene} is out of range; allowed is 0 to {len(player.env.scenes) - 1}")
-    _write_png(png, draw_decision(player, scene=scene, pushes=pushes))
+    _write_image(png, draw_decision(player, scene=scene, pushes=pushes))
 
 
 def describe_scenes(scenes: SceneBank, bank: HullBank) -> str:
@@ -163,11 +164,11 @@ def _object_sets(object_dir: Path | None) -> list[ObjectSet]:
     return both if object_dir is None else [name for name in both if (object_dir / name).is_dir()] or ["seen"]
 
 
-def _load_objects(object_dir: Path | None, object_set: ObjectSet) -> tuple[HullBank, list[Refusal]]:
-    return (builtin_bank(object_set), []) if object_dir is None else load_object_dir(object_dir, object_set)
+def _load_objects(object_dir: Path | None, object_set: ObjectSet) -> LoadedDir:
+    return LoadedDir(builtin_bank(object_set)) if object_dir is None else load_object_dir(object_dir, object_set)
 
 
-def _write_png(path: Path, image: np.ndarray) -> None:
+def _write_image(path: Path, image: np.ndarray) -> None:
     """Write an image and say so."""
-    save_png(path, image)
+    save_image(path, image)
     print(f"wrote {path}")

@@ -11,13 +11,13 @@ from pregrasp_jax import io
 from pregrasp_jax.cli.progress import EpisodeProgress
 from pregrasp_jax.cli.report import FILMS, describe_films, make_film, play_films, write_page
 from pregrasp_jax.config import PRESETS, EvaluationConfig, SceneConfig
-from pregrasp_jax.drawing import save_gif
+from pregrasp_jax.drawing import save_film
 from pregrasp_jax.evaluation import format_evaluations
 from pregrasp_jax.evaluation.player import Player, make_player, run_evaluation
-from pregrasp_jax.machine import enable_compilation_cache
 from pregrasp_jax.report import read_run, write_films
 from pregrasp_jax.report.play import SECONDS_PER_FRAME, draw_tiles, make_panel, make_play
 from pregrasp_jax.report.results import EVALUATIONS
+from pregrasp_jax.startup import prepare
 from pregrasp_jax.training.run_folder import RunFolder
 from pregrasp_jax.training.session import resume
 
@@ -65,7 +65,7 @@ def show_shipped(folder: Path, *, say: Callable[[str], None] = lambda line: prin
         say: told how far it is.
     """
     say(f"{_SHIPPED} plays {_FILMED} test scenes; the first one waits for the compiler")
-    enable_compilation_cache()
+    prepare()
     player = make_player(
         EvaluationConfig(policy=_SHIPPED, scene=SceneConfig(test_scenes=_FILMED), episodes=_FILMED), say=say
     )
@@ -77,7 +77,7 @@ def show_shipped(folder: Path, *, say: Callable[[str], None] = lambda line: prin
     drawn.sort(key=lambda episode: not episode[-1][0].success)
     gif, page = folder / "demo.gif", folder / f"{_SHIPPED}.html"
     frames = [make_panel(player.env, decision, tiles) for episode in drawn for decision, tiles in episode]
-    save_gif(gif, frames, seconds_per_frame=SECONDS_PER_FRAME)
+    save_film(gif, frames, seconds_per_frame=SECONDS_PER_FRAME)
     print(f"wrote {gif}: {_SHIPPED} at work", flush=True)
     write_films(
         page,

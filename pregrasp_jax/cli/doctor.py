@@ -13,12 +13,13 @@ import jax
 
 import pregrasp_jax
 from pregrasp_jax import io
-from pregrasp_jax.machine import CACHE_SWITCH, compilation_cache_dir, versions
+from pregrasp_jax.machine import versions
+from pregrasp_jax.startup import CACHE_SWITCH, check, compilation_cache_dir
 from pregrasp_jax.training import resources
 
 _OPTIONAL = {
-    "warp": "engine warp",
     "tensorboardX": "train.tensorboard",
+    "av": "films as .mp4",
     "OpenGL": "not needed: pictures use no GL",
 }
 
@@ -31,13 +32,14 @@ def describe() -> list[tuple[str, str]]:
         "NPROC": _describe_guard,
         "JAX_PLATFORMS": lambda: os.environ.get("JAX_PLATFORMS") or "unset",
         "jax devices": lambda: ", ".join(f"{device.platform} {device.device_kind}" for device in jax.devices()),
+        "environment": lambda: check() or "usable",
         "engine native": _describe_native,
         "engine mjx": _describe_mjx,
         **{module: partial(_describe_module, module, use) for module, use in _OPTIONAL.items()},
         "free memory": _describe_memory,
         "free disk here": lambda: _gigabytes(resources.available_disk(Path.cwd())),
         "cache": lambda: _describe_folder(io.cache_dir()),
-        "compiled programs": lambda: str(compilation_cache_dir() or f"not kept ({CACHE_SWITCH}=0)"),
+        "compiled programs": _describe_programs,
     }
     return [*versions().items(), *((name, _finding(probe)) for name, probe in probes.items())]
 
@@ -108,6 +110,12 @@ def _describe_memory() -> str:
 
 def _describe_folder(path: Path) -> str:
     return f"{path} ({_gigabytes(_num_bytes(path))}, {_gigabytes(resources.available_disk(path))} free)"
+
+
+def _describe_programs() -> str:
+    if folder := compilation_cache_dir():
+        return str(folder)
+    return f"not kept ({CACHE_SWITCH}=0)" if os.environ.get(CACHE_SWITCH) == "0" else "not kept (cache not writable)"
 
 
 def _num_bytes(folder: Path) -> int:

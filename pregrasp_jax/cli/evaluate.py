@@ -35,7 +35,7 @@ def evaluate_options(
     Args:
         request: What to evaluate.
         json: Write the result here; `pregrasp-jax compare A.json B.json` pairs two of them.
-        video: Write a film of some episodes here.
+        video: Write a film of some episodes here: .gif, .webp, or .mp4 (extra `video`).
         video_episodes: Episodes in the film, from the first scene.
     """
     evaluate(request, json_file=json, video=video, video_episodes=video_episodes)
@@ -49,19 +49,20 @@ def evaluate(
     Args:
         request: what to evaluate.
         json_file: where the evaluation document goes.
-        video: where a GIF of the first `video_episodes` episodes goes.
+        video: where a film of the first `video_episodes` episodes goes.
         video_episodes: at most `request.episodes`.
 
     Raises:
         ValueError: something of the request cannot be used, or a file could not be written afterwards.
     """
+    from pregrasp_jax.cli.outputs import refuse_unwritable
     from pregrasp_jax.cli.progress import EpisodeProgress
     from pregrasp_jax.evaluation import format_evaluation
     from pregrasp_jax.evaluation.player import make_player, run_evaluation
     from pregrasp_jax.report.play import film_episodes
 
-    for path in (json_file, video):
-        refuse_unwritable(path)
+    refuse_unwritable(json_file, "json")
+    refuse_unwritable(video, "film")
     if video and not 1 <= video_episodes <= request.episodes:
         raise ValueError(f"video_episodes = {video_episodes} is out of range; allowed is 1 to {request.episodes}")
     with EpisodeProgress() as progress:
@@ -73,16 +74,3 @@ def evaluate(
         if video:
             progress.say(f"drawing {video_episodes} episodes")
             film_episodes(video, player, episodes=video_episodes, seed=request.seed)
-
-
-def refuse_unwritable(path: Path | None) -> None:
-    """Refuse a file that could not be written, before hours of work are spent on its content.
-
-    Raises:
-        ValueError: it is a folder, or its folder does not allow writing.
-    """
-    if path is None:
-        return
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; allowed is the name of a file")
-    io.refuse_unwritable(path)

@@ -12,9 +12,10 @@ import numpy as np
 
 from pregrasp_jax import drawing
 from pregrasp_jax.assets.sets import load_bank_for
-from pregrasp_jax.cli.evaluate import refuse_unwritable
+from pregrasp_jax.cli.outputs import refuse_unwritable
 from pregrasp_jax.report.play import describe_action, env_hulls, in_batch
 from pregrasp_jax.scene.bank import SceneBank
+from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import Env, assemble
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training.dump import Dump, load_dump
@@ -58,9 +59,10 @@ def replay_dump(
         dump: file that a training wrote to RUN_DIR/dumps.
         engine: push on this engine; the one of the training if left out.
         object_dir: where the meshes of the training lie now; where they lay then if left out.
-        png: draw the scene before and after the push here.
+        png: draw the scene before and after the push here; .png, .jpg, .jpeg or .webp.
     """
-    refuse_unwritable(png)
+    refuse_unwritable(png, "image")
+    prepare()
     loaded = load_dump(dump)
     env = make_replay_env(loaded, engine or loaded.engine, object_dir)
     mishap = loaded.mishap(env)
@@ -68,7 +70,7 @@ def replay_dump(
     replay = make_replay(env)(mishap)
     print("\n".join(describe_replay(env, loaded, mishap, replay)))
     if png:
-        drawing.save_png(png, draw_replay(env, mishap, replay))
+        drawing.save_image(png, draw_replay(env, mishap, replay))
         print(f"wrote {png}")
 
 

@@ -7,17 +7,17 @@ from pathlib import Path
 
 from pregrasp_jax.checkpoint import Policy, checksum, load_policy
 from pregrasp_jax.checkpoint.state import exists
-from pregrasp_jax.cli.evaluate import refuse_unwritable
+from pregrasp_jax.cli.outputs import refuse_unwritable
 from pregrasp_jax.config import AssetsConfig, EvaluationConfig
 from pregrasp_jax.evaluation import load_evaluation
 from pregrasp_jax.evaluation.player import Player, make_player
 from pregrasp_jax.evaluation.runner import Decision
-from pregrasp_jax.machine import enable_compilation_cache
 from pregrasp_jax.report import Film, RunRecord, Step, load_evaluations, read_run, write_report
 from pregrasp_jax.report.page import REPORT, kept_episodes
 from pregrasp_jax.report.play import Tiles, describe_decision, draw_tiles, make_play
 from pregrasp_jax.report.record import SECONDS
 from pregrasp_jax.report.results import evaluation_files, is_of_run
+from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import Env
 
 FILMS, MOST_SCENES = 3, 30
@@ -57,7 +57,8 @@ def report(
             raise ValueError(f"{name} = {value} is out of range; allowed is {lowest} and more")
     run = read_run(run_dir)
     load_evaluations(run, evaluations)  # a damaged one is refused now, not after minutes of playing
-    refuse_unwritable(html or run_dir / REPORT)
+    refuse_unwritable(html or run_dir / REPORT, "html")
+    prepare()
     policy = find_policy(run) if films else None
     shown, note = film_run(run, films=films, scenes=scenes) if films else ([], "")
     path = write_page(run, shown, note, policy=policy, evaluations=evaluations, html=html)
@@ -152,7 +153,6 @@ def film_run(run: RunRecord, *, films: int, scenes: int, say: Say = print) -> tu
     Returns:
         Episodes, successes first, and one sentence that says how they were found.
     """
-    enable_compilation_cache()
     assets = AssetsConfig(
         object_dir=run.setting("assets", "object_dir", None), object_set=run.setting("assets", "object_set", "seen")
     )

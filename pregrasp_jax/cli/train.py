@@ -58,7 +58,7 @@ def _resume(stored: Config) -> Callable[..., Session]:
     ) -> Session:
         """Continue a run from its newest intact checkpoint; its report is written as after the first session.
 
-        Only train.minutes, train.episodes and train.tensorboard may change.
+        Only train.minutes, train.episodes, train.tensorboard and assets.object_dir may change, here or in config.yaml.
 
         Args:
             run_dir: Folder of the run.

@@ -4,6 +4,7 @@ Everything comes from the package's own rasterizer, so no picture needs OpenGL o
 arrays [rows, columns, 3] uint8.
 """
 
+from pregrasp_jax.drawing.files import refuse_film, refuse_image, save_film, save_image
 from pregrasp_jax.drawing.maps import draw_heightmap, draw_q_map, draw_segmentation
 from pregrasp_jax.drawing.shaded import (
     OBSTACLE_COLORS,
@@ -15,7 +16,7 @@ from pregrasp_jax.drawing.shaded import (
     look_at,
     side_view,
 )
-from pregrasp_jax.drawing.sheets import contact_sheet, make_panel, make_tiles, save_gif, save_png
+from pregrasp_jax.drawing.sheets import contact_sheet, make_panel, make_tiles
 
 __all__ = [
     "OBSTACLE_COLORS",
@@ -31,7 +32,9 @@ __all__ = [
     "look_at",
     "make_panel",
     "make_tiles",
-    "save_gif",
-    "save_png",
+    "refuse_film",
+    "refuse_image",
+    "save_film",
+    "save_image",
     "side_view",
 ]

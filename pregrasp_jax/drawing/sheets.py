@@ -1,8 +1,6 @@
-"""Pictures side by side: the panel of one decision, the contact sheet of a bank; and their files."""
+"""Pictures side by side: the panel of one decision, the contact sheet of a bank."""
 
-import io
 from collections.abc import Sequence
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +9,6 @@ from PIL import Image, ImageDraw, ImageFont
 from pregrasp_jax.drawing.maps import draw_heightmap, draw_q_map, draw_segmentation
 from pregrasp_jax.drawing.shaded import draw_camera, look_at, side_view
 from pregrasp_jax.heightmap import HullInstances, object_hulls
-from pregrasp_jax.io import write_bytes
 from pregrasp_jax.spaces.actions import ActionSpace
 from pregrasp_jax.types import HullBank, Observation
 
@@ -80,7 +77,8 @@ def contact_sheet(bank: HullBank, eligible: np.ndarray, *, columns: int = 6) -> 
         hulls = object_hulls(bank, jnp.array([index]), pose)
         points = np.asarray(hulls.vertices)[np.asarray(hulls.present)].reshape(-1, 3)
         wide, deep, high = np.ptp(points, axis=0)
-        view = look_at((0.25, -0.62, 0.42), (0.0, 0.0, 0.115), fovy=np.deg2rad(27.0), shape=(220, 220))
+        # Wide enough for the tallest and widest objects that are taken, whichever way they are turned.
+        view = look_at((0.25, -0.62, 0.42), (0.0, 0.0, 0.14), fovy=np.deg2rad(35.0), shape=(220, 220))
         image = draw_camera(hulls, camera=view)
         role = "target or obstacle" if eligible[index] else "obstacle only"
         size = f"{wide * 100:.1f} x {deep * 100:.1f} x {high * 100:.1f} cm"
@@ -90,28 +88,6 @@ def contact_sheet(bank: HullBank, eligible: np.ndarray, *, columns: int = 6) -> 
     rows = [_row(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
     width = max(row.shape[1] for row in rows)
     return np.concatenate([np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=250) for r in rows])
-
-
-def save_png(path: Path, image: np.ndarray) -> None:
-    """Write an image as PNG, whole or not at all."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="PNG")
-    write_bytes(Path(path), buffer.getvalue())
-
-
-def save_gif(path: Path, frames: Sequence[np.ndarray], *, seconds_per_frame: float = 1.0) -> None:
-    """Write images of one shape as an endless animation, whole or not at all.
-
-    Raises:
-        ValueError: no frames.
-    """
-    if not frames:
-        raise ValueError(f"{path}: an animation needs at least one frame")
-    pictures = [Image.fromarray(frame).quantize(128, dither=Image.Dither.NONE) for frame in frames]
-    buffer = io.BytesIO()
-    duration = round(1000 * seconds_per_frame)
-    pictures[0].save(buffer, format="GIF", save_all=True, append_images=pictures[1:], duration=duration, loop=0)
-    write_bytes(Path(path), buffer.getvalue())
 
 
 def _row(tiles: Sequence[tuple[str, np.ndarray]], *, title: str = "", footer: str = "", gap: int = 8) -> np.ndarray:

@@ -11,13 +11,14 @@ from typing import Any
 import jax
 
 from pregrasp_jax.checkpoint import load_policy
-from pregrasp_jax.config import Config, EvaluationConfig, TaskOverrides
+from pregrasp_jax.config import Config, EvaluationConfig, TaskOverrides, with_absolute_paths
 from pregrasp_jax.evaluation import Evaluator, Progress, evaluation_document
 from pregrasp_jax.learning.q_function import make_q_function
-from pregrasp_jax.machine import announced_compilation, enable_compilation_cache
+from pregrasp_jax.machine import announced_compilation
 from pregrasp_jax.policies import scripts
 from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.policies.scripts import Policy
+from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import Env, make_env, with_task
 
 NUM_ENVS = 16
@@ -60,13 +61,15 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     Raises:
         ValueError: there is no such policy, or something of the request is out of range.
     """
+    prepare()
     trained = _load(request.policy)
     config = _environment_config(request, Config() if trained is None else trained.config)
     if trained is not None:
         _refuse_other_hand(config, trained.config)
-    if trained is not None and trained.config.assets.object_dir != request.assets.object_dir:
-        folders = (trained.config.assets.object_dir, request.assets.object_dir)
-        say("note: trained on {}, evaluated on {}".format(*(folder or "the built-in objects" for folder in folders)))
+        folders = [with_absolute_paths(made).assets.object_dir for made in (trained.config, config)]
+        if folders[0] != folders[1]:
+            names = (folder or "the built-in objects" for folder in folders)
+            say("note: trained on {}, evaluated on {}".format(*names))
 
     def packed(done: int, total: int) -> None:
         if done == total or done % _PACKING < 16:
@@ -102,7 +105,6 @@ def run_evaluation(
     Raises:
         ValueError: more episodes than scenes.
     """
-    enable_compilation_cache()
     start = time.monotonic()
     default = LOOKAHEAD_NUM_ENVS if request.policy == "lookahead" else NUM_ENVS
     evaluator = Evaluator(player.env, num_envs=request.num_envs or default)

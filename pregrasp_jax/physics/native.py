@@ -110,7 +110,7 @@ class Simulations:
         with self._lock:
             self.load(object_ids)
             batch, num_scenes = self._batch, len(state)
-            # The state does not say which objects sleep: all are awake at first, whatever was simulated before.
+            # The state does not say which objects sleep, so all are woken: the result depends on nothing before.
             batch.reset(np.arange(num_scenes))
             batch.state[:num_scenes] = state
             batch.warning[:num_scenes] = 0

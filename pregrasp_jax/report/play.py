@@ -29,10 +29,10 @@ Tiles = list[tuple[str, np.ndarray]]
 
 
 def film_episodes(path: Path, player: Player, *, episodes: int, seed: int) -> None:
-    """Write the first scenes as a GIF with one panel per decision, the same episodes as an evaluation's."""
+    """Write the first scenes as a film with one panel per decision, the same episodes as an evaluation's."""
     play = make_play(player, seed)
     frames = [draw_panel(player, decision) for scene in range(episodes) for decision in play(scene)]
-    drawing.save_gif(path, frames, seconds_per_frame=SECONDS_PER_FRAME)
+    drawing.save_film(path, frames, seconds_per_frame=SECONDS_PER_FRAME)
 
 
 def draw_decision(player: Player, *, scene: int, pushes: int, seed: int = 0) -> np.ndarray:

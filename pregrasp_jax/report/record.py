@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from pregrasp_jax import yaml_file
 from pregrasp_jax.evaluation.statistics import is_interval, is_number
 from pregrasp_jax.report.svg import Point
 
@@ -21,7 +20,7 @@ class RunRecord:
 
     Attributes:
         path: of the folder.
-        config: content of config.yaml.
+        config: what the last session was made with: of manifest.json, or of config.yaml if that does not record it.
         manifest: content of manifest.json, empty if there is none.
         metrics: rows of metrics.jsonl.
         best: what was measured on the validation scenes when the best policy was saved, empty if none was.
@@ -62,16 +61,14 @@ def read_run(path: Path) -> RunRecord:
     config_file = path / "config.yaml"
     if not config_file.is_file():
         raise ValueError(f"{path} is not a run folder (it has no config.yaml); wanted the --run-dir of a training")
-    try:
-        config = yaml.safe_load(config_file.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ValueError(f"{config_file}: {' '.join(str(error).split())}") from None
+    manifest = _read_object(path / "manifest.json")
+    config = manifest.get("config") or yaml_file.read(config_file)
     if not isinstance(config, dict):
         raise ValueError(f"{config_file}: not the settings of a run")
     return RunRecord(
         path=path,
         config=config,
-        manifest=_read_object(path / "manifest.json"),
+        manifest=manifest,
         metrics=_read_rows(path / "metrics.jsonl"),
         best=_read_best(path / "best" / "evaluation.json"),
     )

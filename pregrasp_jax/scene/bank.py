@@ -102,7 +102,7 @@ def load_or_build(
             return load(path, digest)
         except ValueError as error:
             warnings.warn(f"{' '.join(str(error).split())}; its scenes are packed anew", stacklevel=2)
-    io.refuse_unwritable(path)
+    io.refuse_unwritable_cache(path)
     scenes = build(bank, eligible, config, split, threads=threads, progress=progress)
     save(path, scenes)
     return scenes

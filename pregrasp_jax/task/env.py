@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax import geometry, heightmap
+from pregrasp_jax import geometry, heightmap, startup
 from pregrasp_jax.assets.sets import load_bank_for
 from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.physics import make_engine
@@ -187,6 +187,7 @@ def make_env(
     Raises:
         ValueError: the objects or settings cannot be used; one line says why.
     """
+    startup.check()
     threads = config.physics.threads if threads is None else threads
     bank = load_bank_for(config.assets.object_dir, config.assets.object_set)
     eligible = eligible_targets(get_robot(config.task.robot), bank)

@@ -2,11 +2,13 @@
 
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Callable
 from typing import Any, TextIO
 
 from rich.console import Console as RichConsole
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from pregrasp_jax import io
 
 PLAIN_INTERVAL = 10.0
 """s between plain lines: a log file is read, not watched."""
@@ -19,13 +21,19 @@ class _Forgiving:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        with suppress(OSError):
-            self._stream.write(text)
+        self._try(lambda: self._stream.write(text))
         return len(text)
 
     def flush(self) -> None:
-        with suppress(OSError):
-            self._stream.flush()
+        self._try(self._stream.flush)
+
+    def _try(self, use: Callable[[], object]) -> None:
+        try:
+            use()
+        except BrokenPipeError:
+            io.discard(self._stream)
+        except OSError:
+            pass
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)

@@ -16,14 +16,19 @@ from typing import Any, TextIO
 import jax
 
 from pregrasp_jax import io
-from pregrasp_jax.checkpoint.policy import read_config, write_config
+from pregrasp_jax.checkpoint.run_config import (
+    CONFIG,
+    MANIFEST,
+    WHAT_MAY_CHANGE,
+    fixed_difference,
+    read_manifest,
+    stored_config,
+    write_config,
+)
 from pregrasp_jax.checkpoint.state import exists
-from pregrasp_jax.config import Config, difference
+from pregrasp_jax.config import Config, difference, to_dict
 from pregrasp_jax.machine import versions
 from pregrasp_jax.training.event_log import EventLog
-
-EXTENDABLE = ("train.minutes", "train.episodes", "train.tensorboard")
-"""Settings that may change when a run is resumed: they say when it stops and what it tells, not what it does."""
 
 
 class RunFolder:
@@ -76,7 +81,7 @@ class RunFolder:
         """
         refuse_used(path)
         folder = cls(path, _locked(path))
-        write_config(path / "config.yaml", config)
+        write_config(path / CONFIG, config)
         return folder
 
     @classmethod
@@ -85,17 +90,16 @@ class RunFolder:
 
         Args:
             path: a folder that `create` made.
-            config: its configuration, up to `EXTENDABLE`.
+            config: its configuration, up to `CHANGEABLE`.
 
         Raises:
-            ValueError: no run, one that has lost its checkpoints, in use by another process, or another configuration;
-                the latter lists the difference.
+            ValueError: no run, one that has lost its checkpoints, in use by another process, or another configuration
+                than it was made with, be it that of `config` or that of an edited config.yaml; the latter two list the
+                difference.
         """
-        changed = difference(stored_config(path), config)
-        if refused := [line for line in changed if line.split(":")[0] not in EXTENDABLE]:
+        if refused := fixed_difference(stored_config(path), config):
             raise ValueError(
-                f"run {path} cannot be resumed with a changed configuration ({'; '.join(refused)}); allowed to change: "
-                f"{', '.join(EXTENDABLE)}; --init-from starts a new run from its parameters"
+                f"run {path} cannot be resumed with a changed configuration ({'; '.join(refused)}); {WHAT_MAY_CHANGE}"
             )
         folder = WatchedFolder(path)
         if not folder.has_checkpoint and (folder.best.exists() or folder.metrics.exists()):
@@ -122,23 +126,24 @@ class RunFolder:
         Raises:
             ValueError: the run began with other objects or scenes, or its manifest is damaged.
         """
-        file = self.path / "manifest.json"
-        manifest = _read_manifest(file) if file.exists() else {"hashes": hashes, "sessions": []}
+        manifest = read_manifest(self.path) or {"hashes": hashes, "sessions": []}
         then = manifest["hashes"]
         for name in then | hashes:
             if then.get(name) != hashes.get(name):
                 raise ValueError(
                     f"run {self.path} began with another {name} ({then.get(name)}, now {hashes.get(name)}); resume it "
-                    "with the same objects, MuJoCo and package version; --init-from starts a new run from its parameters"
+                    "with the same objects, MuJoCo and package version; --init-from starts a new run from its "
+                    "parameters"
                 )
         if difference(stored_config(self.path), config):
-            write_config(self.path / "config.yaml", config)
+            write_config(self.path / CONFIG, config)
         session = {
             "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "versions": versions(),
             "machine": describe_machine(),
         }
-        io.write_json(file, manifest | {"sessions": [*manifest["sessions"], session]})
+        record = {"config": to_dict(config), "sessions": [*manifest["sessions"], session]}
+        io.write_json(self.path / MANIFEST, manifest | record)
 
     def begin_event_log(self, *, resumed_at: int | None = None) -> None:
         """Write what is appended to metrics.jsonl to TensorBoard's files too (see `EventLog`)."""
@@ -206,27 +211,14 @@ def refuse_used(path: Path) -> None:
     """
     if path.exists() and not path.is_dir():
         raise ValueError(f"run folder {path} is a file; allowed is a new or empty folder")
-    if (path / "config.yaml").exists():
+    if (path / CONFIG).exists():
         raise ValueError(
             f"run folder {path} already holds a run; continue it with `pregrasp-jax train resume {path}`, or choose "
             "another --run-dir"
         )
     if path.exists() and any(entry.name != "run.lock" for entry in path.iterdir()):
         raise ValueError(f"run folder {path} is not empty and holds no run; allowed is a new or empty folder")
-    io.refuse_unwritable(path / "config.yaml")
-
-
-def stored_config(path: Path) -> Config:
-    """Return the configuration of the run in a folder.
-
-    Raises:
-        ValueError: the folder holds no run, or its config.yaml is damaged.
-    """
-    if not (path / "config.yaml").is_file():
-        raise ValueError(
-            f"{path} is not a run folder (it has no config.yaml); allowed is the --run-dir of an earlier run"
-        )
-    return read_config(path / "config.yaml")
+    io.refuse_unwritable(path / CONFIG)
 
 
 def describe_machine() -> dict[str, Any]:
@@ -237,17 +229,6 @@ def describe_machine() -> dict[str, Any]:
         "cores": os.cpu_count(),
         "devices": [device.device_kind for device in jax.local_devices()],
     }
-
-
-def _read_manifest(file: Path) -> dict[str, Any]:
-    try:
-        manifest = json.loads(file.read_bytes())
-        return {"hashes": dict(manifest["hashes"]), "sessions": list(manifest["sessions"])}
-    except (ValueError, KeyError, TypeError):
-        raise ValueError(
-            f"{file} is damaged; it says which objects and scenes the run began with. Put a copy back, or delete it to "
-            "go on with those that the configuration names"
-        ) from None
 
 
 def _describe_row(line: str) -> tuple[float, bool]:

@@ -1,5 +1,6 @@
 """A training session: objects, scenes, program and run folder put together, then the loop of `trainer`."""
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import Any
@@ -8,11 +9,11 @@ import jax
 
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint.policy import load_policy
-from pregrasp_jax.config import Config, to_dict
+from pregrasp_jax.config import Config, to_dict, with_absolute_paths
 from pregrasp_jax.evaluation import Evaluator
 from pregrasp_jax.learning.q_function import Params, make_q_function
-from pregrasp_jax.machine import enable_compilation_cache
 from pregrasp_jax.policies.learned import make_learned
+from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.training import processes, resources, trainer
 from pregrasp_jax.training.console import Console
@@ -46,27 +47,29 @@ def train(config: Config, run_dir: Path, *, init_from: Path | None = None, conso
     Raises:
         ValueError: one line says what cannot be used, and what is allowed.
     """
+    prepare()
     if processes.is_first():
         refuse_used(run_dir)
     params = None if init_from is None else load_policy(init_from).params
-    return _session(config, run_dir, None, params, console or _console())
+    return _session(with_absolute_paths(config), run_dir, None, params, console or _console())
 
 
 def resume(config: Config, run_dir: Path, *, console: Console | None = None) -> int:
     """Continue a run from its newest intact checkpoint; the rest is as in `train`.
 
     Args:
-        config: of the run; only its limits may differ (`run_folder.EXTENDABLE`).
+        config: of the run; only what `run_config.CHANGEABLE` names may differ.
         run_dir: folder of the run.
         console: told about progress.
     """
+    prepare()
+    config = with_absolute_paths(config)
     folder = RunFolder.open(run_dir, config) if processes.is_first() else WatchedFolder(run_dir)
     with folder:
         return _session(config, run_dir, folder, None, console or _console())
 
 
 def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
-    enable_compilation_cache()
     config.validate()
     if config.train.tensorboard:
         require_module()
@@ -78,7 +81,7 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
     program = make_program(env, config, params=params, layout=layout)
     resources.check(*program.shapes().split(), run_dir)
     hashes = _hashes(env, validation)
-    processes.refuse_difference(io.content_hash(to_dict(config), hashes))
+    processes.refuse_difference(_digest(config, hashes))
     resumed, folder = folder is not None, folder or _create(run_dir, config)
     evaluate, compile_evaluation = make_evaluate(validation, config)
     dump = make_dump(env, config)
@@ -158,6 +161,12 @@ def _load(config: Config, split: Any, console: Console) -> Env:
             console.say(f"packing {split} scenes: {done} of {total}")
 
     return make_env(config, split=split, progress=packed)
+
+
+def _digest(config: Config, hashes: dict[str, str]) -> str:
+    """Return what all processes of a run must agree on; where its meshes lie may differ between hosts."""
+    somewhere = dataclasses.replace(config.assets, object_dir=None)
+    return io.content_hash(to_dict(dataclasses.replace(config, assets=somewhere)), hashes)
 
 
 def _hashes(env: Env, validation: Env) -> dict[str, str]:
