@@ -23,8 +23,8 @@ from pregrasp_jax import io
 from pregrasp_jax.checkpoint import save_policy
 from pregrasp_jax.cli import commands, doctor, film, player, progress
 from pregrasp_jax.cli.evaluate import evaluate
-from pregrasp_jax.evaluation.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.config import PRESETS, AssetsConfig, Config, PhysicsConfig, SceneConfig, TaskConfig
+from pregrasp_jax.evaluation.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.learning.networks import QNetwork
 from pregrasp_jax.physics import mjx_version
 from pregrasp_jax.scene.bank import SceneBank

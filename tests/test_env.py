@@ -13,10 +13,10 @@ import pytest
 
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import Config, SceneConfig
-from pregrasp_jax.task.env import Env, make_env, with_task
 from pregrasp_jax.physics import make_engine
 from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene.model import hull_points, parking_poses
+from pregrasp_jax.task.env import Env, make_env, with_task
 from pregrasp_jax.types import CLOSED, MAX_OBJECTS, OPEN, REASONS, ROBOT_ID, SceneParams
 
 NAMES = builtin_bank("seen").names

@@ -12,9 +12,9 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 from test_env import START, unstack
 
-from pregrasp_jax.task import env as env_module
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import Config, ExplorationConfig, PhysicsConfig, SceneConfig, TaskConfig
+from pregrasp_jax.task import env as env_module
 from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.types import MAX_OBJECTS, OPEN, SceneParams
 

@@ -7,8 +7,8 @@ import pytest
 from heightmap_oracle import box_cloud, cast_rays, make_instances, random_clouds
 
 from pregrasp_jax import heightmap
-from pregrasp_jax.spaces import grid
 from pregrasp_jax.heightmap import Camera, HullInstances
+from pregrasp_jax.spaces import grid
 
 CAMERA = Camera(position=jnp.array([0.0, 0.0, 1.0]), rotation=jnp.eye(3), fovy=jnp.deg2rad(42.5))
 orthographic, pinhole, render_pinhole, unproject = map(

@@ -8,9 +8,9 @@ import pytest
 from heightmap_oracle import box_cloud, cast_rays, hull_planes, make_instances, pad, random_clouds
 
 from pregrasp_jax import heightmap
-from pregrasp_jax.spaces import grid
 from pregrasp_jax.geometry import transform_points
 from pregrasp_jax.robot import description, kinematics, model
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.types import (
     FULL_TOPOLOGY,
     MAX_HULLS,

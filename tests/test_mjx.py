@@ -9,11 +9,11 @@ import pytest
 from mjx_oracle import CoarseModel
 from mujoco import mjx as mujoco_mjx
 
-from pregrasp_jax.task import push
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.physics import mjx, mjx_model
 from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene.model import parking_poses
+from pregrasp_jax.task import push
 from pregrasp_jax.types import CLOSED, MAX_HULLS, MAX_OBJECTS, OPEN, SceneParams
 
 NUM_SLOTS = 3

@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 from fake_training import TinyNetwork, input_fn
 
-from pregrasp_jax.policies import scripts
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import PRESETS, Config, SceneConfig
-from pregrasp_jax.task.env import Env
 from pregrasp_jax.evaluation import Evaluator
 from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.physics import mjx
+from pregrasp_jax.policies import scripts
 from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.training import collect, program
 from pregrasp_jax.training.mishap import NONE
 from pregrasp_jax.types import MAX_OBJECTS, OPEN, REASONS, SceneParams

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pregrasp_jax.task import push
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import SceneConfig
 from pregrasp_jax.physics import make_engine
@@ -13,6 +12,7 @@ from pregrasp_jax.physics.base import CTRL_DT, Engine
 from pregrasp_jax.robot import model as robot
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses
+from pregrasp_jax.task import push
 from pregrasp_jax.types import OPEN, SceneParams
 
 ENDS = ((-0.2, 0.0), (-0.25, 0.1), (-0.15, 0.0))

@@ -14,10 +14,10 @@ from PIL import Image
 
 from pregrasp_jax import __main__ as main_module
 from pregrasp_jax import drawing
-from pregrasp_jax.spaces import grid
 from pregrasp_jax.cli import commands, film, player
-from pregrasp_jax.evaluation.player import EvaluationConfig, Player, make_player
 from pregrasp_jax.config import Config, SceneConfig
+from pregrasp_jax.evaluation.player import EvaluationConfig, Player, make_player
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.types import OPEN
 

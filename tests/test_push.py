@@ -6,21 +6,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pregrasp_jax.robot import get_robot, kinematics
+from pregrasp_jax.robot.base import hand_pose_of
+from pregrasp_jax.robot.ur5e_rg2 import FINGER_CLOSED, FINGER_OPEN
 from pregrasp_jax.spaces import grid
-from pregrasp_jax.task import push
-from pregrasp_jax.physics.base import CTRL_DT
-from pregrasp_jax.robot import kinematics
-from pregrasp_jax.robot import model as robot
-from pregrasp_jax.types import CLOSED, OPEN
+from pregrasp_jax.spaces.workspace import TABLE
+from pregrasp_jax.task import primitive, push
+from pregrasp_jax.task.primitive import Stroke
+from pregrasp_jax.types import CTRL_DT, OBSTRUCTIONS
 
+ROBOT = get_robot("ur5e_rg2")
 SPEED = 0.1
 NUM_ROWS = push.num_push_rows(0.15, SPEED)
-PLAN = jax.jit(functools.partial(push.plan_push, push_speed=SPEED, num_rows=NUM_ROWS))
+PLAN = jax.jit(functools.partial(push.plan_push, ROBOT, TABLE, push_speed=SPEED, num_rows=NUM_ROWS))
 
 
-def plan(start, end, before=OPEN, after=OPEN):
-    joints = jnp.asarray(robot.home_joint_pos()[:6])
-    return PLAN(joints, jnp.asarray(start, jnp.float32), jnp.asarray(end, jnp.float32), before, after)
+def plan(start, end, before=FINGER_OPEN, after=FINGER_OPEN, *, yaw=0.0, z=0.1):
+    here = hand_pose_of((0.0, 0.0), z=0.1, yaw=0.0, aperture=before).replace(xy=jnp.asarray(start, jnp.float32))
+    there = hand_pose_of((0.0, 0.0), z=z, yaw=yaw, aperture=after).replace(xy=jnp.asarray(end, jnp.float32))
+    return PLAN(jnp.asarray(ROBOT.home), Stroke(here, there))
 
 
 def loop_mask(p1, r_in, r_out, full):
@@ -37,38 +41,38 @@ def loop_mask(p1, r_in, r_out, full):
 @pytest.mark.parametrize("full", [False, True])
 @pytest.mark.parametrize("p1", [(-0.30, 0.0), (0.0025, 0.0025), (0.2475, -0.2475), (0.4, 0.0)])
 def test_half_ring_is_the_loop_over_cells(p1, full):
-    mask = push.half_ring_mask(jnp.array(p1), r_in=0.04, r_out=0.15, full_ring=full)
+    mask = grid.half_ring(jnp.array(p1), r_in=0.04, r_out=0.15, full=full)
     np.testing.assert_array_equal(mask, loop_mask(p1, 0.04, 0.15, full))
 
 
 def test_half_ring_ends_are_inclusive():
     p1 = grid.cell_to_world(jnp.int32(50), jnp.int32(20))
-    mask = push.half_ring_mask(p1, r_in=0.04, r_out=0.15)
+    mask = grid.half_ring(p1, r_in=0.04, r_out=0.15)
     assert mask[50, 28] and not mask[50, 27], "r_in = 8 cells straight ahead"
     assert mask[50, 50] and not mask[50, 51], "r_out = 30 cells straight ahead"
     assert mask[80, 20] and mask[20, 20] and not mask[80, 19], "exactly sideways belongs to it, backward does not"
 
 
 def test_half_ring_is_mirror_symmetric():
-    up = push.half_ring_mask(jnp.array([-0.1, 0.03]), r_in=0.04, r_out=0.15)
-    down = push.half_ring_mask(jnp.array([-0.1, -0.03]), r_in=0.04, r_out=0.15)
+    up = grid.half_ring(jnp.array([-0.1, 0.03]), r_in=0.04, r_out=0.15)
+    down = grid.half_ring(jnp.array([-0.1, -0.03]), r_in=0.04, r_out=0.15)
     np.testing.assert_array_equal(up, down[::-1])
 
 
 def test_minimum_jerk_meets_its_boundary_conditions():
-    np.testing.assert_allclose(push.minimum_jerk(jnp.array([-1.0, 0.0, 0.5, 1.0, 2.0])), [0, 0, 0.5, 1, 1])
-    velocity = jax.vmap(jax.grad(push.minimum_jerk))(jnp.array([1e-3, 0.5, 1 - 1e-3]))
+    np.testing.assert_allclose(primitive.minimum_jerk(jnp.array([-1.0, 0.0, 0.5, 1.0, 2.0])), [0, 0, 0.5, 1, 1])
+    velocity = jax.vmap(jax.grad(primitive.minimum_jerk))(jnp.array([1e-3, 0.5, 1 - 1e-3]))
     np.testing.assert_allclose(velocity, [0, 1.875, 0], atol=1e-4)
 
 
 def test_push_times_and_fingers():
     kept = plan((-0.3, 0.0), (-0.2, 0.0))
-    changed = plan((-0.3, 0.0), (-0.2, 0.0), OPEN, CLOSED)
+    changed = plan((-0.3, 0.0), (-0.2, 0.0), FINGER_OPEN, FINGER_CLOSED)
     assert kept.num_ctrl == math.ceil((1.0 + push.SETTLE_TIME) / CTRL_DT)
     assert changed.num_ctrl - kept.num_ctrl == round(push.APERTURE_TIME / CTRL_DT)
     fingers = np.asarray(changed.ctrl[:, 6])
-    assert fingers[0] == pytest.approx(robot.FINGER_OPEN)
-    assert fingers[int(push.APERTURE_TIME / CTRL_DT) + 1] == pytest.approx(robot.FINGER_CLOSED, abs=1e-6)
+    assert fingers[0] == pytest.approx(FINGER_OPEN)
+    assert fingers[int(push.APERTURE_TIME / CTRL_DT) + 1] == pytest.approx(FINGER_CLOSED, abs=1e-6)
     still = np.asarray(changed.ctrl[: int(push.APERTURE_TIME / CTRL_DT), :6])
     np.testing.assert_allclose(still, np.broadcast_to(still[0], still.shape), atol=1e-5)
 
@@ -87,10 +91,10 @@ def test_too_long_or_short_plans(end):
 
 
 def test_out_of_reach_is_unreachable():
-    joints = jnp.asarray(robot.home_joint_pos()[:6])
-    far = jnp.array([[-0.3 + 0.004 * i, 0.0, 0.1] for i in range(200)])
-    commands, ok = jax.jit(push.plan_arm)(joints, far)
-    assert ok[5] and not ok[-1]
+    far = jnp.array([[-0.3 + 0.004 * i, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0] for i in range(200)])
+    follow = jax.jit(functools.partial(ROBOT.follow, workspace=TABLE))
+    commands, code = follow(jnp.asarray(ROBOT.home), far, jnp.full(200, FINGER_OPEN))
+    assert code[5] == OBSTRUCTIONS.index("none") and code[-1] == OBSTRUCTIONS.index("no_ik")
     assert np.isfinite(commands).all(), "a missing solution must not leak NaN into the controls"
 
 
@@ -106,3 +110,34 @@ def test_plan_traces_once():
     jitted(jnp.array([-0.2, 0.0]))
     jitted(jnp.array([-0.2, 0.1]))
     assert count == 1
+
+
+def test_a_push_that_is_refused_says_why_and_executes_nothing():
+    for end, z, reason in (
+        ((-0.1, 0.0), 0.1, "none"),
+        ((-0.05, 0.0), 0.1, "too_long"),
+        ((-0.2, 0.0), -0.05, "table"),
+        ((-0.2, 0.0), 2.4, "no_ik"),
+    ):
+        found = plan((-0.3, 0.0), end, z=z)
+        assert OBSTRUCTIONS[int(found.obstruction)] == reason, end
+        assert bool(found.reachable) == (reason == "none")
+        assert (int(found.num_ctrl) > 0) == (float(found.seconds) > 0) == (reason == "none")
+
+
+def test_the_hand_turns_the_shorter_way_and_changes_its_height_on_the_way():
+    found = plan((-0.3, 0.0), (-0.2, 0.05), yaw=0.4, z=0.15)
+    assert found.reachable
+    hand = jax.vmap(kinematics.grasp_pose)(found.ctrl[:, :6])
+    np.testing.assert_allclose(hand[0, :3], [-0.3, 0.0, 0.1], atol=1e-4)
+    np.testing.assert_allclose(hand[-1], [-0.2, 0.05, 0.15, math.cos(0.2), 0, 0, math.sin(0.2)], atol=1e-4)
+    around = plan((-0.3, 0.0), (-0.2, 0.05), yaw=0.4 - 2 * math.pi, z=0.15)
+    np.testing.assert_allclose(around.ctrl, found.ctrl, atol=1e-4)
+    early = hand[int(0.2 / CTRL_DT)]
+    assert 0.1 < early[2] < 0.15 and 0 < early[6] < math.sin(0.2)
+
+
+def test_a_half_ring_turns_with_the_hand():
+    ahead = np.asarray(grid.half_ring(np.array([0.0, 0.0]), r_in=0.04, r_out=0.15))
+    left = np.asarray(grid.half_ring(np.array([0.0, 0.0]), r_in=0.04, r_out=0.15, yaw=np.pi / 2))
+    np.testing.assert_array_equal(left, ahead.T)
