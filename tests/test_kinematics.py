@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from pregrasp_jax.robot import description, kinematics
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot import description, get_robot, kinematics
 
+ROBOT = get_robot("ur5e_rg2")
 NUM = 400
 BRANCHES = list(itertools.product((1, -1), repeat=3))
 
@@ -27,7 +27,7 @@ def random_joints(seed=0):
 def workspace_poses():
     x, y = np.meshgrid(np.linspace(-0.3, 0.25, 12), np.linspace(-0.25, 0.25, 11))
     poses = np.zeros((x.size, 7), np.float32)
-    poses[:, 0], poses[:, 1], poses[:, 2], poses[:, 3] = x.ravel(), y.ravel(), robot.PUSH_HEIGHT, 1.0
+    poses[:, 0], poses[:, 1], poses[:, 2], poses[:, 3] = x.ravel(), y.ravel(), 0.1, 1.0
     return poses
 
 
@@ -56,7 +56,7 @@ def test_grasp_pose_is_mujocos():
     joints = random_joints()
     poses = np.asarray(grasp_poses(joints))
     for row, pose in zip(joints, poses, strict=True):
-        data.qpos[robot.joint_qpos_ids(mj_model)[:6]] = row
+        data.qpos[ROBOT.joint_qpos_ids(mj_model)[:6]] = row
         mujoco.mj_kinematics(mj_model, data)
         np.testing.assert_allclose(pose[:3], data.site("grasp_point").xpos, atol=1e-6)
         rotation = np.zeros(9)
