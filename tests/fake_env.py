@@ -60,15 +60,15 @@ def fake_rules(task: TaskConfig, measure: Any = None) -> Rules:
     return judging(is_open, task, measure=measure)
 
 
-def make_outcome(num_objects: int = MAX_OBJECTS, **fields: Any) -> Outcome:
+def make_outcome(**fields: Any) -> Outcome:
     """Return what an open hand did that met nothing, ended nowhere nearer and enclosed nothing, but for `fields`."""
     plain = Outcome(
-        coverage=jnp.zeros(num_objects),
+        coverage=jnp.zeros(MAX_OBJECTS),
         aperture=jnp.float32(1.0),
-        distance_before=jnp.full(num_objects, 0.2),
-        distance_after=jnp.full(num_objects, 0.2),
-        toppled=jnp.zeros(num_objects, bool),
-        off_table=jnp.zeros(num_objects, bool),
+        distance_before=jnp.full(MAX_OBJECTS, 0.2),
+        distance_after=jnp.full(MAX_OBJECTS, 0.2),
+        toppled=jnp.zeros(MAX_OBJECTS, bool),
+        off_table=jnp.zeros(MAX_OBJECTS, bool),
         obstruction=jnp.int32(0),
         no_action=jnp.zeros((), bool),
         diverged=jnp.zeros((), bool),

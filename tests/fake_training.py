@@ -75,7 +75,8 @@ class TinyNetwork(nn.Module):
 
 def make_program(config: Config, env: Any = None, **options: Any) -> program.Program:
     q_function = QFunction(TinyNetwork(width=config.network.width), ACTIONS, input_fn)
-    return program.make_program(env or PictureEnv(), config, q_function=q_function, **options)
+    scenes: Any = env or PictureEnv()
+    return program.make_program(scenes, config, q_function=q_function, **options)
 
 
 def evaluate(params: Any) -> dict[str, Any]:

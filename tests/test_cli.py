@@ -19,16 +19,18 @@ from scripts import load_script
 
 import pregrasp_jax
 from pregrasp_jax import __main__ as main_module
-from pregrasp_jax import io
+from pregrasp_jax import io, machine
 from pregrasp_jax.checkpoint import save_policy
-from pregrasp_jax.cli import commands, doctor, film, player, progress
+from pregrasp_jax.cli import commands, doctor, progress
 from pregrasp_jax.cli.evaluate import evaluate
 from pregrasp_jax.config import PRESETS, AssetsConfig, Config, PhysicsConfig, SceneConfig, TaskConfig
+from pregrasp_jax.evaluation import player
 from pregrasp_jax.evaluation.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.learning.networks import QNetwork
 from pregrasp_jax.physics import mjx_version
+from pregrasp_jax.report import play as report_play
 from pregrasp_jax.scene.bank import SceneBank
-from pregrasp_jax.training import program, resources
+from pregrasp_jax.training import resources
 
 EVALUATE = load_script("evaluate")
 
@@ -133,7 +135,7 @@ def test_a_trained_policy_keeps_its_task_and_meets_everybodys_scenes(fake_world:
     assert document["camera"] == "pinhole" and document["episodes"] == 3
     state = made.env.reset_to(jax.numpy.int32(0))
     assert made.q_values is not None
-    q = np.where(np.asarray(made.env.action_mask(state.p1))[..., None], made.q_values(state), -np.inf)
+    q = np.where(np.asarray(made.env.action_mask(state.hand)), made.q_values(state), -np.inf)
     assert int(made.policy(state, jax.random.key(0))) == q.argmax()
 
 
@@ -148,7 +150,7 @@ def test_a_smaller_ring_changes_where_the_shipped_policy_may_push_not_what_it_se
     state = usual.env.reset_to(jax.numpy.int32(0))
     assert usual.q_values is not None and narrow.q_values is not None
     np.testing.assert_array_equal(usual.q_values(state), narrow.q_values(state))
-    assert narrow.env.action_mask(state.p1).sum() < usual.env.action_mask(state.p1).sum()
+    assert narrow.env.action_mask(state.hand).sum() < usual.env.action_mask(state.hand).sum()
     with pytest.raises(ValueError, match=r"r_out = 0.25 is out of range; allowed for this policy, .* is 0.04 to 0.2"):
         make_player(EvaluationConfig(policy="pretrained", r_out=0.25))
 
@@ -166,7 +168,7 @@ def test_a_film_shows_the_episodes_that_are_counted(fake_world: list[Config], po
     made = make_player(request)
     rows = run_evaluation(request, made)["rows"]
     assert ends <= {row["reason"] for row in rows}, "or nothing would be said about how these look"
-    play = film.make_play(made, seed=5)
+    play = report_play.make_play(made, seed=5)
     for row in rows:
         *pushes, last = play(row["scene"])
         assert all(decision.ending == "" for decision in pushes) and last.action is None
@@ -214,12 +216,12 @@ def test_doctor_names_what_a_bug_report_needs(run: Any) -> None:
 
 def test_the_compilation_cache_has_an_off_switch(monkeypatch: pytest.MonkeyPatch) -> None:
     changed: list[tuple[str, Any]] = []
-    monkeypatch.setattr(program.jax.config, "update", lambda *change: changed.append(change))
-    program.enable_compilation_cache()
+    monkeypatch.setattr(machine.jax.config, "update", lambda *change: changed.append(change))
+    machine.enable_compilation_cache()
     assert not changed, "these tests have chosen a folder, which stays"
     assert dict(doctor.describe())["compiled programs"] == jax.config.values["jax_compilation_cache_dir"]
-    monkeypatch.setenv(program.CACHE_SWITCH, "0")
-    program.enable_compilation_cache()
+    monkeypatch.setenv(machine.CACHE_SWITCH, "0")
+    machine.enable_compilation_cache()
     assert changed == [("jax_enable_compilation_cache", False)], "whatever folder is set"
     assert dict(doctor.describe())["compiled programs"] == "not kept (PREGRASP_JAX_COMPILATION_CACHE=0)"
 

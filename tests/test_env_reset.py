@@ -122,7 +122,7 @@ def test_settings_that_cannot_work_are_refused(monkeypatch):
     make_env(Config(scene=SceneConfig(test_scenes=3), task=TaskConfig(r_out=0.06)), split="test")
     monkeypatch.setattr(env_module.scene_bank, "load_or_build", lambda *_, **__: pytest.fail("packed too early"))
     for field, allowed in (("workspace", "table"), ("robot", "ur5e_rg2"), ("primitive", "push")):
-        task = TaskConfig(**{field: "nowhere"})
+        task = dataclasses.replace(TaskConfig(), **{field: "nowhere"})  # pyright: ignore[reportArgumentType]
         with pytest.raises(ValueError, match=rf"task\.{field} = 'nowhere' does not exist; allowed: .*{allowed}"):
             make_env(Config(task=task), split="test")
 
@@ -132,11 +132,11 @@ def test_settings_that_cannot_work_are_refused(monkeypatch):
     [
         (
             Box(center=(0.3, 0.0, 0.1), half_size=(0.1, 0.4, 0.1)),
-            r"wall 1 comes within 0\.200 m of the centre, .*0\.245",
+            r"wall 1 comes within 0\.200 m .* is 0\.245",
         ),
         (
             Box(center=(-0.5, 0.0, 0.3), half_size=(0.01, 0.4, 0.3)),
-            r"wall 1 is -?0\.\d+ m from robot ur5e_rg2 .*0\.015",
+            r"wall 1 is -?0\.\d+ m from .* is 0\.015",
         ),
     ],
 )
@@ -150,15 +150,11 @@ def test_walls_in_the_way_are_refused(wall, said):
 def test_objects_that_no_hand_can_take_are_refused():
     bank = builtin_bank("seen")
     wide = [i for i, why in enumerate(ROBOT.eligibility(bank).reasons) if why]
-    with pytest.raises(
-        ValueError, match=rf"none of {len(wide)} objects can be a target for robot ur5e_rg2; .* narrowest"
-    ):
+    with pytest.raises(ValueError, match=rf"none of {len(wide)} objects .* robot ur5e_rg2; .* narrowest"):
         env_module.eligible_targets(ROBOT, select(bank, wide))
 
 
 def test_a_robot_without_a_closing_region_has_no_such_rules(env):
     handless = dataclasses.replace(ROBOT, closing_region=None)
-    with pytest.raises(
-        ValueError, match="robot ur5e_rg2 has no closing region; allowed for primitive push is one that"
-    ):
+    with pytest.raises(ValueError, match="robot ur5e_rg2 has no closing region; allowed for primitive push"):
         make_rules(handless, env.workspace, env.primitive, env.bank, env.task)

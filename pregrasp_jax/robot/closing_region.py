@@ -103,7 +103,8 @@ def eligibility(bank: HullBank, region: ClosingRegion, *, max_width: float) -> E
 
 def _ineligibility(bank: HullBank, index: int, region: ClosingRegion, max_width: float) -> str:
     """Return why an object cannot be a target, one clause; empty if it can."""
-    width, found = float(bank.min_width[index]), best_coverage(*projection(bank, index), region, enough=MIN_TARGET_COVERAGE)
+    width = float(bank.min_width[index])
+    found = best_coverage(*projection(bank, index), region, enough=MIN_TARGET_COVERAGE)
     reasons = []
     if width >= max_width:
         reasons.append(f"narrowest width {width * 1e3:.1f} mm, must be < {max_width * 1e3:.0f}")
