@@ -11,9 +11,9 @@ from typing import Annotated
 import tyro
 
 from pregrasp_jax.cli.evaluate import evaluate
-from pregrasp_jax.evaluation.player import EvaluationConfig
 from pregrasp_jax.command_line import one_line_errors, parse
 from pregrasp_jax.config import AssetsConfig, Camera, ObjectSet, PhysicsConfig, SceneConfig
+from pregrasp_jax.evaluation.player import EvaluationConfig
 
 
 @dataclass(frozen=True, kw_only=True)

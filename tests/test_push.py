@@ -92,7 +92,7 @@ def test_too_long_or_short_plans(end):
 
 def test_out_of_reach_is_unreachable():
     far = jnp.array([[-0.3 + 0.004 * i, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0] for i in range(200)])
-    follow = jax.jit(lambda *path: ROBOT.follow(*path, TABLE))
+    follow = jax.jit(lambda joints, poses, fingers: ROBOT.follow(joints, poses, fingers, TABLE))
     commands, code = follow(jnp.asarray(ROBOT.home), far, jnp.full(200, FINGER_OPEN))
     assert code[5] == OBSTRUCTIONS.index("none") and code[-1] == OBSTRUCTIONS.index("no_ik")
     assert np.isfinite(commands).all(), "a missing solution must not leak NaN into the controls"

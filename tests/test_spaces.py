@@ -64,7 +64,7 @@ def test_a_mirrored_map_has_at_every_push_what_the_other_has_at_its_reflection(a
 def test_how_the_hand_is_held():
     for choices in (np.array([4, 0]), jnp.array([4, 0])):
         z, yaw, aperture = FIVE.held(choices)
-        np.testing.assert_array_equal([z, yaw, aperture], np.float32([[0.14, 0.10], [-0.2, 0.5], [0.0, 0.3]]))
+        np.testing.assert_array_equal([z, yaw, aperture], np.array([[0.14, 0.10], [-0.2, 0.5], [0.0, 0.3]], np.float32))
         assert z.dtype == yaw.dtype == aperture.dtype == np.float32
     assert float(jax.jit(FIVE.held)(jnp.int32(3))[0]) == float(np.float32(0.13))
     assert (FIVE.widest, FIVE.narrowest) == (1, 4) and (TWO.widest, TWO.narrowest) == (1, 0)
@@ -130,6 +130,7 @@ def test_corners_of_a_wall_and_its_distance_to_the_origin():
         turned.corners()[-1], [0.5 + 0.1 * np.sqrt(0.75) - 0.01, 0.25 + 0.02 * np.sqrt(0.75), 0.6]
     )
     # Points of its outline, one by one.
+    root = np.sqrt(0.75)
     axes = np.array([[root, 0.5], [-0.5, root]])
     local = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 2001), np.linspace(-0.02, 0.02, 401)), axis=-1).reshape(-1, 2)
     nearest = np.linalg.norm(local @ axes + [0.5, 0.2], axis=1).min()
