@@ -27,34 +27,35 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from pregrasp_jax import heightmap
-from pregrasp_jax.spaces import grid
-from pregrasp_jax.task import push
 from pregrasp_jax.config import PRESETS
+from pregrasp_jax.policies.exploration import draw_choice
+from pregrasp_jax.spaces import grid
 from pregrasp_jax.task.env import Env, make_env
-from pregrasp_jax.types import CLOSED, OPEN, EnvState
+from pregrasp_jax.task.primitive import Plan
+from pregrasp_jax.task.push import SETTLE_TIME
+from pregrasp_jax.types import EnvState
 
 LENGTHS = (0.05, 0.15)
 """m; push lengths are uniform in this range, 0.1 m on average."""
 
-SETTLE_TIME = push.SETTLE_TIME
 
-
-def sample_action(state: EnvState, key: jax.Array) -> jax.Array:
+def sample_action(env: Env, state: EnvState, key: jax.Array) -> jax.Array:
     """Return a push of random length toward the target, within 0.5 rad, open with probability 0.7."""
     length_key, angle_key, open_key = jax.random.split(key, 3)
-    offset = state.centroids[state.scene.target] - state.p1
+    actions, here = env.primitive.actions, state.hand.xy
+    offset = state.target_xy - here
     angle = jnp.atan2(offset[1], offset[0]) + 0.5 * jax.random.normal(angle_key)
     length = jax.random.uniform(length_key, minval=LENGTHS[0], maxval=LENGTHS[1])
-    p2 = state.p1 + length * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-    row, col = grid.world_to_cell(jnp.clip(p2, -0.249, 0.249))
-    return grid.encode_action(row, col, jnp.where(jax.random.bernoulli(open_key, 0.7), OPEN, CLOSED))
+    end = here + length * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    row, col = grid.world_to_cell(jnp.clip(end, -0.249, 0.249))
+    return actions.encode(row, col, draw_choice(open_key, actions, open_probability=0.7))
 
 
 def full_step(env: Env, state: EnvState, key: jax.Array) -> tuple[EnvState, jax.Array]:
     """Push, then reset the scenes that ended; what training does between two updates."""
     action_key, reset_key = jax.random.split(key)
     num_scenes = state.num_pushes.shape[0]
-    actions = jax.vmap(sample_action)(state, jax.random.split(action_key, num_scenes))
+    actions = jax.vmap(functools.partial(sample_action, env))(state, jax.random.split(action_key, num_scenes))
     next_state, result = jax.vmap(env.step)(state, actions)
     fresh = jax.vmap(env.reset)(jax.random.split(reset_key, num_scenes))
     ended = result.terminated | result.truncated
@@ -62,7 +63,7 @@ def full_step(env: Env, state: EnvState, key: jax.Array) -> tuple[EnvState, jax.
     def choose(new: jax.Array, old: jax.Array) -> jax.Array:
         return jnp.where(ended.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
-    return jax.tree.map(choose, fresh, next_state), jnp.linalg.norm(next_state.p1 - state.p1, axis=-1)
+    return jax.tree.map(choose, fresh, next_state), jnp.linalg.norm(next_state.hand.xy - state.hand.xy, axis=-1)
 
 
 def measure(num_scenes: int, num_steps: int) -> dict[str, Any]:
@@ -102,13 +103,14 @@ def measure(num_scenes: int, num_steps: int) -> dict[str, Any]:
 def compile_stages(env: Env) -> dict[str, Callable[..., Any]]:
     """Return the stages of a step, each vmapped and compiled alone."""
 
-    def physics(state: EnvState, plan: push.Plan) -> Any:
-        return env.engine.run(state.physics, plan.ctrl, jnp.where(plan.reachable, plan.num_ctrl, 0))
+    def physics(state: EnvState, plan: Plan) -> Any:
+        return env.engine.run(state.physics, plan.ctrl, plan.num_ctrl)
 
     def look(state: EnvState) -> Any:
-        return heightmap.observe(heightmap.scene_hulls(env.bank, state.scene, state.physics_obs), state.p1)
+        hulls = heightmap.scene_hulls(env.bank, env.robot, state.scene, state.physics_obs, env.workspace)
+        return heightmap.observe(hulls, state.hand)
 
-    stages = {"action": sample_action, "plan": env.plan, "physics": physics, "heightmap": look}
+    stages = {"action": functools.partial(sample_action, env), "plan": env.plan, "physics": physics, "heightmap": look}
     return {name: jax.jit(jax.vmap(function)) for name, function in stages.items()}
 
 

@@ -20,12 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax.config import PRESETS, AssetsConfig
-from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.physics import native
 from pregrasp_jax.physics.mjx_model import make_reference_model
-from pregrasp_jax.robot import model as robot
-from pregrasp_jax.robot.closing_region import closing_region_bounds
+from pregrasp_jax.robot.description import palm_to_grasp_point
 from pregrasp_jax.scene.model import parking_poses
+from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.types import MAX_OBJECTS, EnvState, SceneParams
 
 NUM_YAWS = 6
@@ -42,8 +41,7 @@ def scene_at_palm(env: Env, obj: int, yaw: float, offset: np.ndarray) -> ScenePa
     points = np.asarray(env.bank.full.vertices)[hulls[hulls >= 0]].reshape(-1, 3)[:, :2]
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     points = points @ turn.T
-    palm = closing_region_bounds()[0][0]
-    x = robot.START_POSE[0] + palm + GAP - points[:, 0].min()
+    x = float(env.robot.start.xy[0]) - palm_to_grasp_point() + GAP - points[:, 0].min()
     y = -(points[:, 1].min() + points[:, 1].max()) / 2
     poses = parking_poses()
     poses[0] = [x + offset[0], y + offset[1], 0, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
@@ -64,8 +62,9 @@ def main() -> None:
     config = dataclasses.replace(PRESETS["ci"], assets=assets)
     env = make_env(config, split="test")
     if arguments.like_mjx:
-        env = dataclasses.replace(env, engine=native.make_engine(env.bank, model=make_reference_model(env.bank)))
-    objects = [int(i) for i in np.flatnonzero(np.asarray(env.bank.eligible))]
+        place = env.bank, env.robot, env.workspace
+        env = dataclasses.replace(env, engine=native.make_engine(*place, model=make_reference_model(*place)))
+    objects = [int(i) for i in np.flatnonzero(env.eligible)]
     cases = [(i, yaw) for i in objects for yaw in np.pi / NUM_YAWS * np.arange(NUM_YAWS)]
     forward, aside = SCATTER if arguments.scatter else (0.0, 0.0)
     offsets = np.random.default_rng(0).uniform((0, -aside), (forward, aside), (len(cases), 2))

@@ -8,6 +8,7 @@ with --object-dir, those beginning with `original_` with rays on the original me
 """
 
 import argparse
+import functools
 import json
 import os
 import platform
@@ -25,13 +26,17 @@ from scipy.spatial import ConvexHull
 from timing import best_ms
 
 from pregrasp_jax import heightmap
-from pregrasp_jax.spaces import grid
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.meshes import load_mesh, load_object_dir, mesh_folder
 from pregrasp_jax.assets.settings import load_settings
-from pregrasp_jax.robot import description, kinematics
-from pregrasp_jax.robot.model import home_joint_pos, joint_qpos_ids
+from pregrasp_jax.robot import get_robot
+from pregrasp_jax.robot.links import pose_to_matrix
+from pregrasp_jax.scene.spec import compile_spec, scene_spec
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.spaces.workspace import TABLE
 from pregrasp_jax.types import MAX_OBJECTS, ROBOT_ID, HullBank, Observation, PhysicsObservation, SceneParams
+
+ROBOT = get_robot("ur5e_rg2")
 
 SPACING = 0.1
 """m between the objects, which stand on a 3 x 3 pattern with one place free."""
@@ -53,10 +58,15 @@ def make_scenes(bank: HullBank, count: int, rng: np.random.Generator) -> tuple[S
         poses.append(np.concatenate([xy, np.zeros((MAX_OBJECTS, 1)), quat], axis=1))
         hands.append([rng.uniform(-0.25, 0.1), rng.uniform(-0.15, 0.15), 0.1, 1, 0, 0, 0])
     poses, hand_pose = jnp.asarray(np.stack(poses), jnp.float32), jnp.asarray(hands, jnp.float32)
-    home = jnp.asarray(home_joint_pos())
-    solve = jax.jit(lambda pose: kinematics.nearest_solution(kinematics.hand_inverse_kinematics(pose), home[:6]))
-    joint_pos = jnp.concatenate([jax.vmap(solve)(hand_pose), jnp.broadcast_to(home[6:], (count, 2))], axis=1)
-    assert not np.isnan(joint_pos).any(), "a hand pose is out of reach"
+    home = jnp.asarray(ROBOT.home)
+
+    def solve(pose: jax.Array) -> tuple[jax.Array, jax.Array]:
+        controls, code = ROBOT.follow(home, jnp.stack([pose] * 2), jnp.stack([home[6]] * 2), TABLE)
+        return controls[0, :6], code[0]
+
+    arm, code = jax.jit(jax.vmap(solve))(hand_pose)
+    joint_pos = jnp.concatenate([arm, jnp.broadcast_to(home[6:], (count, 2))], axis=1)
+    assert (code == 0).all(), "a hand pose is out of reach"
     scene = SceneParams(jnp.asarray(np.stack(ids), jnp.int32), poses, jnp.zeros(count, jnp.int32))
     return scene, PhysicsObservation(poses, joint_pos, hand_pose, jnp.zeros(count, bool), jnp.zeros(count, jnp.int32))
 
@@ -89,11 +99,11 @@ def model_of_hulls(hulls: heightmap.HullInstances) -> tuple[mujoco.MjModel, np.n
 
 def model_of_originals(meshes: list[trimesh.Trimesh], ids: np.ndarray) -> tuple[mujoco.MjModel, np.ndarray]:
     """Compile robot, table, and the original meshes of the objects; return the model and the label of each geom."""
-    spec = description.load_spec()
+    spec = scene_spec(ROBOT, TABLE)
     for slot, index in enumerate(ids):
         mesh = meshes[index]
         add_mesh(spec, f"original{slot}", mesh.vertices, mesh.faces, np.array([0, 0, 0, 1, 0, 0, 0]))
-    mj_model = spec.compile()
+    mj_model = compile_spec(spec)
     labels = np.full(mj_model.ngeom, ROBOT_ID)
     labels[mj_model.geom("table").id] = 0
     for slot in range(len(ids)):
@@ -162,14 +172,14 @@ def load_originals(object_dir: Path, object_set: str, bank: HullBank) -> list[tr
 
 def place(mesh: trimesh.Trimesh, pose: np.ndarray) -> trimesh.Trimesh:
     """Return a copy of a mesh at a pose [7]."""
-    return mesh.copy().apply_transform(description.pose_to_matrix(pose[:3], pose[3:]))
+    return mesh.copy().apply_transform(pose_to_matrix(pose[:3], pose[3:]))
 
 
 def with_robot_at(mj_model: mujoco.MjModel, joint_pos: np.ndarray | None) -> mujoco.MjData:
     """Return data with kinematics done, the robot (if there is one) at joint positions [8]."""
     mj_data = mujoco.MjData(mj_model)
     if joint_pos is not None:
-        mj_data.qpos[joint_qpos_ids(mj_model)] = joint_pos
+        mj_data.qpos[ROBOT.joint_qpos_ids(mj_model)] = joint_pos
         for side in ("left", "right"):
             mj_data.joint(f"hand_{side}_tip").qpos[0] = -mj_data.joint(f"hand_{side}_driver").qpos[0]
     mujoco.mj_forward(mj_model, mj_data)
@@ -181,12 +191,12 @@ def measure(args: argparse.Namespace) -> dict[str, float]:
     bank = load_object_dir(args.object_dir, "seen")[0] if args.object_dir else builtin_bank("seen")
     scene, physics_obs = make_scenes(bank, args.scenes, np.random.default_rng(args.seed))
     camera = heightmap.overhead_camera()
-    hulls = jax.jit(jax.vmap(heightmap.scene_hulls, (None, 0, 0)))(bank, scene, physics_obs)
+    place_hulls = functools.partial(heightmap.scene_hulls, bank, ROBOT)
+    hulls = jax.jit(jax.vmap(place_hulls))(scene, physics_obs)
 
     def timed(view: str | heightmap.Camera) -> float:
         def look(scene: SceneParams, physics_obs: PhysicsObservation) -> Observation:
-            hulls = heightmap.scene_hulls(bank, scene, physics_obs)
-            return heightmap.observe(hulls, physics_obs.hand_pose[:2], camera=view)
+            return heightmap.observe(place_hulls(scene, physics_obs), ROBOT.start, camera=view)
 
         run = jax.jit(jax.vmap(look))
         return best_ms(lambda: run(scene, physics_obs), repetitions=args.repetitions) / args.scenes

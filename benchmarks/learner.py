@@ -21,13 +21,16 @@ import jax.numpy as jnp
 import optax
 from timing import best_ms
 
-from pregrasp_jax.config import NetworkConfig, TaskConfig
-from pregrasp_jax.spaces.grid import GRID_SIZE
+from pregrasp_jax.config import LearnerConfig, NetworkConfig, TaskConfig
 from pregrasp_jax.learning import learner
 from pregrasp_jax.learning.networks import num_parameters
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.learning.replay import Batch
-from pregrasp_jax.task.push import half_ring_mask
+from pregrasp_jax.robot import get_robot
+from pregrasp_jax.spaces.grid import GRID_SIZE
+from pregrasp_jax.spaces.workspace import TABLE
+from pregrasp_jax.task.push import make_push
+from pregrasp_jax.types import REASONS, HandPose
 
 MATMUL_SIZE = 2048
 
@@ -52,7 +55,7 @@ def forward_gflop(width: float) -> float:
 
 def random_batch(key: jax.Array, batch_size: int) -> Batch:
     """Return transitions with random images and actions all over the grid."""
-    key_inputs, key_next, key_action, key_p1 = jax.random.split(key, 4)
+    key_inputs, key_next, key_action, key_xy = jax.random.split(key, 4)
     shape = (batch_size, GRID_SIZE, GRID_SIZE, 2)
     return Batch(
         inputs=jax.random.normal(key_inputs, shape),
@@ -60,7 +63,10 @@ def random_batch(key: jax.Array, batch_size: int) -> Batch:
         action=jax.random.randint(key_action, (batch_size,), 0, 2 * GRID_SIZE**2),
         reward=jnp.ones(batch_size),
         terminated=jnp.zeros(batch_size, bool),
-        next_p1=jax.random.uniform(key_p1, (batch_size, 2), minval=-0.2, maxval=0.1),
+        reason=jnp.zeros(batch_size, jnp.int32),
+        next_hand=HandPose(
+            jax.random.uniform(key_xy, (batch_size, 2), minval=-0.2, maxval=0.1), *jnp.zeros((3, batch_size))
+        ),
         importance_weights=jnp.ones(batch_size),
         hindsight=jnp.zeros(batch_size, bool),
         rows=jnp.arange(batch_size),
@@ -69,7 +75,9 @@ def random_batch(key: jax.Array, batch_size: int) -> Batch:
 
 def measure(width: float, batch: Batch, *, repetitions: int, seconds: float) -> dict[str, float]:
     """Return ms per sample of forward and update, and the number of parameters."""
-    q = make_q_function(NetworkConfig(width=width), TaskConfig())
+    task, robot = TaskConfig(), get_robot("ur5e_rg2")
+    push = make_push(robot, TABLE, task, max_distance=task.r_out)
+    q = make_q_function(NetworkConfig(width=width), task, push.actions)
     params = jax.jit(q.init)(jax.random.key(0))
     forward = jax.jit(q.apply)
     optimizer = optax.adam(1e-4)
@@ -77,10 +85,11 @@ def measure(width: float, batch: Batch, *, repetitions: int, seconds: float) -> 
     update = jax.jit(
         functools.partial(
             learner.update,
-            apply_fn=q.apply,
-            q_at_fn=q.of_action,
-            mask_fn=functools.partial(half_ring_mask, r_in=0.04, r_out=0.2),
+            q=q,
+            mask_fn=push.mask,
+            successes=(REASONS.index("target_in_region"),),
             optimizer=optimizer,
+            config=LearnerConfig(),
         ),
         donate_argnums=0,
     )

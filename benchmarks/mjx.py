@@ -28,9 +28,13 @@ from pregrasp_jax.assets.bank import select
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.physics import mjx, mjx_model
 from pregrasp_jax.physics.hull_collision import Limits
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene.model import parking_poses
+from pregrasp_jax.scene.spec import compile_spec, scene_spec
+from pregrasp_jax.spaces.workspace import TABLE
 from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, HullBank, SceneParams
+
+ROBOT = get_robot("ur5e_rg2")
 
 SUBSTEPS = 5
 """Physics steps of a control row."""
@@ -75,11 +79,11 @@ def measure_ours(
     bank: HullBank, num_scenes: int, rows: int, *, objects: int, hulls: int, limits: Limits
 ) -> dict[str, Any]:
     """Time the engine with `objects` slots of `hulls` geoms, all scenes different."""
-    engine = mjx.make_engine(bank, num_slots=objects, num_hulls=hulls, limits=limits)
+    engine = mjx.make_engine(bank, ROBOT, TABLE, num_slots=objects, num_hulls=hulls, limits=limits)
     scenes = [grid_scene(bank, objects, seed) for seed in range(num_scenes)]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *scenes)
     state = jax.vmap(lambda scene: engine.reset(engine.init(), scene))(batch)
-    ctrl = jnp.broadcast_to(jnp.asarray(robot.home_joint_pos()[:7]), (num_scenes, rows, 7))
+    ctrl = jnp.broadcast_to(jnp.asarray(ROBOT.home[:7]), (num_scenes, rows, 7))
     num_ctrl = jnp.full(num_scenes, rows)
     run = jax.jit(jax.vmap(engine.run))
     result = measure(run, (state, ctrl, num_ctrl), num_scenes * rows * SUBSTEPS)
@@ -100,7 +104,7 @@ def measure_ours(
 def measure_stock(bank: HullBank, num_scenes: int, rows: int, *, objects: int) -> dict[str, Any]:
     """Time `mjx.step` on the same objects, each with a mesh of its own, all scenes the same."""
     scene = grid_scene(bank, objects, 0)
-    spec = robot.load_spec()
+    spec = scene_spec(ROBOT, TABLE)
     mjx_model.set_options(spec, None)
     for slot, object_id in enumerate(np.asarray(scene.object_ids)[:objects]):
         mesh = spec.add_mesh(name=f"hull_{slot}")
@@ -110,9 +114,9 @@ def measure_stock(bank: HullBank, num_scenes: int, rows: int, *, objects: int) -
         body = spec.worldbody.add_body(name=f"object_{slot}", pos=np.asarray(scene.poses[slot, :3], np.float64))
         body.add_freejoint()
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=3, mass=float(bank.mass[object_id]))
-    mj_model = spec.compile()
+    mj_model = compile_spec(spec)
     data = mujoco.MjData(mj_model)
-    robot.set_home(mj_model, data)
+    ROBOT.set_home(mj_model, data)
     m = stock_mjx.put_model(mj_model)
     d = stock_mjx.put_data(mj_model, data)
     batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_scenes, *jnp.shape(x))), d)

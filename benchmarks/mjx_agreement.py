@@ -15,6 +15,7 @@ import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
 
 # isort: split
 import argparse
+import dataclasses
 import json
 import sys
 from importlib import metadata
@@ -25,18 +26,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax.spaces import grid
 from pregrasp_jax.assets.sets import load_bank_for
-from pregrasp_jax.config import SceneConfig, TaskConfig
-from pregrasp_jax.task.env import Env
-from pregrasp_jax.task.rules import TARGET_IN_REGION
+from pregrasp_jax.config import Config, SceneConfig
 from pregrasp_jax.physics import mjx, native
 from pregrasp_jax.physics.base import Engine
 from pregrasp_jax.physics.mjx_model import make_mjx_slot_model, make_reference_model
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.bank import SceneBank
-from pregrasp_jax.types import OPEN, REASONS, HullBank, SceneParams
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.spaces.workspace import TABLE
+from pregrasp_jax.task.env import Env, assemble
+from pregrasp_jax.task.push import push_actions
+from pregrasp_jax.task.rules import TARGET_IN_REGION
+from pregrasp_jax.types import REASONS, HullBank, SceneParams
+
+ROBOT = get_robot("ur5e_rg2")
 
 DISTANCE = 0.15
 """m of a push."""
@@ -72,12 +77,13 @@ def near_scenes(bank: HullBank, scenes: SceneBank, count: int, shift: float = 0.
 
 def actions_towards_targets(scenes: SceneParams) -> jax.Array:
     """Return for each scene [S] the open push of `DISTANCE` towards its target, at most 75 degrees aside."""
-    start = np.asarray(robot.START_POSE[:2])
+    start = np.asarray(ROBOT.start.xy)
     target = np.take_along_axis(np.asarray(scenes.poses), np.asarray(scenes.target)[:, None, None], axis=1)[:, 0, :2]
     angle = np.clip(np.arctan2(*(target - start).T[::-1]), -np.radians(75), np.radians(75))
     ends = start + DISTANCE * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     row, col = grid.world_to_cell(jnp.asarray(ends, jnp.float32))
-    return jnp.asarray(grid.encode_action(row, col, jnp.int32(OPEN)))
+    actions = push_actions(ROBOT)
+    return actions.encode(row, col, jnp.int32(actions.widest))
 
 
 def push_all(env: Env, scenes: SceneParams, actions: jax.Array, batch: int) -> dict[str, np.ndarray]:
@@ -136,19 +142,19 @@ def percentiles(values: np.ndarray) -> dict[str, float] | None:
 
 def measure_pushes(bank: HullBank, scenes: SceneBank, count: int, batch: int) -> dict[str, Any]:
     """Push the same scenes with all engines and compare."""
-    task = TaskConfig()
+    env = assemble(Config(), bank, scenes)
     near, shifted = (near_scenes(bank, scenes, count, shift) for shift in (0.0, SHIFT))
     actions = actions_towards_targets(near)
 
     def with_engine(engine: Engine, start: SceneParams, size: int) -> dict[str, np.ndarray]:
-        return push_all(Env(task, bank, scenes, engine, task.r_out), start, actions, size)
+        return push_all(dataclasses.replace(env, engine=engine), start, actions, size)
 
-    reference = native.make_engine(bank, model=make_reference_model(bank))
+    reference = native.make_engine(bank, ROBOT, TABLE, model=make_reference_model(bank, ROBOT, TABLE))
     c, c_shifted, own = (
         with_engine(engine, start, count)
-        for engine, start in ((reference, near), (reference, shifted), (native.make_engine(bank), near))
+        for engine, start in ((reference, near), (reference, shifted), (env.engine, near))
     )
-    ours = with_engine(mjx.make_engine(bank), near, batch)
+    ours = with_engine(mjx.make_engine(bank, ROBOT, TABLE), near, batch)
     present = np.asarray(near.object_ids) >= 0
     return {
         "scenes": count,
@@ -165,7 +171,7 @@ def measure_contacts(bank: HullBank, scenes: SceneBank, count: int) -> dict[str,
     from mjx_contacts import AMPLE, EXACT, UNIQUE, make_contacts_of, touching_pairs
     from mjx_oracle import CoarseModel
 
-    model = make_mjx_slot_model(bank, limits=AMPLE)
+    model = make_mjx_slot_model(bank, ROBOT, TABLE, limits=AMPLE)
     pairs = touching_pairs(model, CoarseModel(bank), make_contacts_of(model), scenes, count)
     table = {}
     for kind in sorted({pair.kind for pair in pairs}):
@@ -205,7 +211,9 @@ def main() -> None:
     parser.add_argument("--object-dir", help="folder of meshes instead of the built-in catalogue")
     arguments = parser.parse_args()
     bank = load_bank_for(arguments.object_dir, arguments.object_set)
-    scenes = scene_bank.load_or_build(bank, SceneConfig(test_scenes=max(arguments.scenes, 3)), "test")
+    scenes = scene_bank.load_or_build(
+        bank, ROBOT.eligibility(bank).eligible, SceneConfig(test_scenes=max(arguments.scenes, 3)), "test"
+    )
     versions = {name: metadata.version(name) for name in ("mujoco", "mujoco-mjx", "jax", "jaxlib")}
     document: dict[str, Any] = {"device": jax.devices()[0].device_kind, "versions": versions}
     if arguments.states:

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from pregrasp_jax.evaluation.player import EvaluationConfig, Player, make_player, run_evaluation
 from pregrasp_jax.config import AssetsConfig
+from pregrasp_jax.evaluation.player import EvaluationConfig, Player, make_player, run_evaluation
+from pregrasp_jax.evaluation.statistics import compare
 from pregrasp_jax.physics import native
 from pregrasp_jax.physics.mjx_model import DIFFERENCES, make_reference_model
-from pregrasp_jax.evaluation.statistics import compare
 
 SHIFT = 1e-6
 """m; standard deviation."""
@@ -32,8 +32,8 @@ SHIFT = 1e-6
 
 def with_differences(player: Player, differences: Collection[str]) -> Player:
     """Return the player with an engine that differs from `native` so."""
-    bank = player.env.bank
-    engine = native.make_engine(bank, model=make_reference_model(bank, differences))
+    place = player.env.bank, player.env.robot, player.env.workspace
+    engine = native.make_engine(*place, model=make_reference_model(*place, differences))
     return dataclasses.replace(player, env=dataclasses.replace(player.env, engine=engine))
 
 

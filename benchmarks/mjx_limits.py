@@ -20,12 +20,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax.policies import scripts
 from pregrasp_jax.config import AssetsConfig, Config, SceneConfig
-from pregrasp_jax.task.env import Env, make_env
-from pregrasp_jax.task.rules import RUNNING
 from pregrasp_jax.physics.mjx import LIMITS
 from pregrasp_jax.physics.mjx_model import make_mjx_slot_model
+from pregrasp_jax.policies import scripts
+from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.rules import RUNNING
 
 sys.path.append(str(Path(__file__).parent.parent / "tests"))
 from mjx_contacts import AMPLE, make_contacts_of
@@ -73,7 +73,7 @@ def main() -> None:
     env = make_env(config, split="test")
     moments = states_of_pushes(env, arguments.scenes, arguments.pushes, arguments.every)
     object_ids, qpos = (np.concatenate(part) for part in zip(*moments, strict=True))
-    contacts_of = make_contacts_of(make_mjx_slot_model(env.bank, limits=AMPLE))
+    contacts_of = make_contacts_of(make_mjx_slot_model(env.bank, env.robot, env.workspace, limits=AMPLE))
     counts = []
     for first in range(0, len(qpos), arguments.scenes):
         index = np.minimum(np.arange(first, first + arguments.scenes), len(qpos) - 1)

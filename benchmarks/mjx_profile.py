@@ -27,10 +27,13 @@ from mujoco.mjx._src import constraint, forward, smooth, solver
 from pregrasp_jax.assets.bank import select
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.physics import mjx
-from pregrasp_jax.physics.base import NUM_CONTROLS
 from pregrasp_jax.physics.hull_collision import collide
 from pregrasp_jax.physics.mjx_model import MjxSlotModel, fill_slots, make_mjx_slot_model
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot import get_robot
+from pregrasp_jax.spaces.workspace import TABLE
+
+ROBOT = get_robot("ur5e_rg2")
+NUM_CONTROLS = len(ROBOT.actuators)
 
 Stage = Callable[[Any, Any, jax.Array], Any]
 """(model, data, hull ids) -> data."""
@@ -66,7 +69,7 @@ _TINY = 1e-30
 
 def time_prefix(model: MjxSlotModel, parts: list[Stage], batch: tuple[Any, ...], steps: int) -> float:
     """Return seconds of `steps` repetitions of some stages on all scenes (object ids, qpos, qvel, warm start)."""
-    template, ctrl = stock_mjx.make_data(model.mjx_model), jnp.asarray(robot.home_joint_pos()[:NUM_CONTROLS])
+    template, ctrl = stock_mjx.make_data(model.mjx_model), jnp.asarray(ROBOT.home[:NUM_CONTROLS])
 
     def run(object_ids: jax.Array, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array) -> jax.Array:
         m, ids = fill_slots(model, object_ids)
@@ -101,13 +104,13 @@ def main() -> None:
     objects, hulls = arguments.size
     bank = builtin_bank("seen")
     bank = select(bank, np.flatnonzero((np.asarray(bank.object_hulls) >= 0).sum(axis=1) <= hulls))
-    model = make_mjx_slot_model(bank, limits=mjx.LIMITS, num_slots=objects, num_hulls=hulls)
-    engine = mjx.make_engine(bank, num_slots=objects, num_hulls=hulls)
+    model = make_mjx_slot_model(bank, ROBOT, TABLE, limits=mjx.LIMITS, num_slots=objects, num_hulls=hulls)
+    engine = mjx.make_engine(bank, ROBOT, TABLE, num_slots=objects, num_hulls=hulls)
     rows = {}
     for num_scenes in arguments.scenes:
         scenes = jax.tree.map(lambda *x: jnp.stack(x), *[grid_scene(bank, objects, seed) for seed in range(num_scenes)])
         state = jax.vmap(lambda scene: engine.reset(engine.init(), scene))(scenes)
-        hold = jnp.broadcast_to(jnp.asarray(robot.home_joint_pos()[:NUM_CONTROLS]), (num_scenes, SETTLE, NUM_CONTROLS))
+        hold = jnp.broadcast_to(jnp.asarray(ROBOT.home[:NUM_CONTROLS]), (num_scenes, SETTLE, NUM_CONTROLS))
         state = jax.jit(jax.vmap(engine.run))(state, hold, jnp.full(num_scenes, SETTLE))
         batch = state.object_ids[:, :objects], state.qpos, state.qvel, state.qacc_warmstart
         parts, before, row = [], 0.0, {}

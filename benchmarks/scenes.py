@@ -11,7 +11,8 @@ import json
 import time
 
 from pregrasp_jax.assets.sets import load_bank_for
-from pregrasp_jax.config import SceneConfig
+from pregrasp_jax.config import SceneConfig, TaskConfig
+from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene import bank as scene_bank
 
 
@@ -23,8 +24,9 @@ def main() -> None:
     parser.add_argument("--object-dir", help="folder of meshes instead of the built-in catalogue")
     arguments = parser.parse_args()
     bank = load_bank_for(arguments.object_dir, arguments.object_set)
+    eligible = get_robot(TaskConfig().robot).eligibility(bank).eligible
     start = time.perf_counter()
-    scenes = scene_bank.build(bank, SceneConfig(train_scenes=arguments.scenes), "train")
+    scenes = scene_bank.build(bank, eligible, SceneConfig(train_scenes=arguments.scenes), "train")
     seconds = time.perf_counter() - start
     rates = {"scenes_per_second": len(scenes) / seconds, "accepted_share": len(scenes) / scenes.tries}
     print(json.dumps(rates | {"scenes": len(scenes), "tries": scenes.tries}))

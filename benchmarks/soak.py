@@ -23,9 +23,9 @@ import jax
 import numpy as np
 
 from pregrasp_jax.config import PRESETS, Config
-from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.startup import prepare
+from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.training import collect
 from pregrasp_jax.types import EnvState
 
@@ -49,7 +49,7 @@ def num_astray(states: EnvState, outcome: Any) -> int:
     present = np.asarray(states.scene.object_ids) >= 0
     poses = np.asarray(states.physics_obs.object_poses)
     below = (present & (poses[..., 2] < MIN_HEIGHT)).any(axis=1)
-    measured = (states.physics_obs, states.obs, states.centroids, states.p1, outcome)
+    measured = (states.physics_obs, states.obs, states.centroids, outcome)
     infinite = [
         ~np.isfinite(np.asarray(leaf).reshape(len(present), -1)).all(axis=1) for leaf in jax.tree.leaves(measured)
     ]
@@ -58,12 +58,12 @@ def num_astray(states: EnvState, outcome: Any) -> int:
 
 def soak(env: Env, num_pushes: int, config: Config) -> dict[str, Any]:
     """Push until `num_pushes` are done, and return the findings."""
-    q = make_q_function(config.network, config.task)
+    q = make_q_function(config.network, config.task, env.primitive.actions)
     params = jax.jit(q.init)(jax.random.key(config.seed))
     make_actors = functools.partial(collect.init_actors, env=env, num_envs=config.train.num_envs)
     actors = jax.jit(make_actors)(jax.random.key(config.seed))
     push = collect.make_collect(env, q, config.exploration, warmup=config.learner.warmup)
-    push = jax.jit(push, donate_argnums=0).lower(actors, params).compile()
+    push = push.compile(actors, params)
     num_steps = -(-num_pushes // config.train.num_envs)
     marks = {max(1, round(share * num_steps)): f"{share:.0%}" for share in (0.1, 0.5, 1.0)}
     memory, astray = {}, 0
@@ -75,7 +75,7 @@ def soak(env: Env, num_pushes: int, config: Config) -> dict[str, Any]:
             memory[marks[step]] = memory_bytes()
             print(f"{marks[step]} after {time.perf_counter() - start:.0f} s", file=sys.stderr)
     seconds = time.perf_counter() - start
-    counts = collect.report(actors.tally)
+    counts = collect.metrics(actors.tally, env.rules.successes)
     reasons = {name.removeprefix("reasons/"): n for name, n in counts.items() if name.startswith("reasons/")}
     return {
         "pushes": counts["env_steps"],

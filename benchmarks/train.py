@@ -25,9 +25,9 @@ from timing import best_ms
 
 from pregrasp_jax.checkpoint.state import save
 from pregrasp_jax.config import PRESETS, Config
-from pregrasp_jax.task.env import make_env
 from pregrasp_jax.learning import learner, replay
 from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.task.env import make_env
 from pregrasp_jax.training.program import Program, TrainState, make_program
 
 STEPS = 40
@@ -62,7 +62,7 @@ def measure(config: Config) -> dict[str, Any]:
     env = make_env(config, split="train")
     program = make_program(env, config)
     state, experience = fill(program, jax.jit(program.init)(jax.random.key(0)))
-    q = make_q_function(config.network, config.task)
+    q = make_q_function(config.network, config.task, env.primitive.actions)
     learning, states, key = state.learning, state.actors.env_states, jax.random.key(1)
     params, memory = learning.learner.params, learning.replay
     num_envs = config.train.num_envs
@@ -76,7 +76,7 @@ def measure(config: Config) -> dict[str, Any]:
         )
 
     def target(params: Any, batch: replay.Batch) -> jax.Array:
-        return jax.vmap(learner.max_q)(q.apply(params, batch.next_inputs), jax.vmap(env.action_mask)(batch.next_p1))
+        return jax.vmap(learner.max_q)(q.apply(params, batch.next_inputs), jax.vmap(env.action_mask)(batch.next_hand))
 
     reset, collect, act, sample, target = (
         jax.jit(f) for f in (jax.vmap(env.reset), program.collect, act, sample, target)

@@ -5,18 +5,17 @@ import io
 import json
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, TextIO
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import numpy as np
-from fake_env import FakeEnv
+from fake_env import ACTIONS, FakeEnv
 
 from pregrasp_jax.config import PRESETS, Config, from_dict, to_dict
 from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.spaces import grid
+from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training import program
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.dump import make_dump
@@ -31,29 +30,20 @@ TIME = "time/"
 class PictureEnv(FakeEnv):
     """The fake world with random resets, and pictures that say where everything is."""
 
-    bank: Any = dataclasses.field(
-        default_factory=lambda: SimpleNamespace(eligible=np.array([True, True, False]), content_hash="hulls")
-    )
-    engine: Any = dataclasses.field(
-        default_factory=lambda: SimpleNamespace(name="native", coordinates=lambda _: (np.zeros(0), np.zeros(0)))
-    )
-
     def reset(self, key: jax.Array) -> EnvState:
         return self._draw(self.reset_to(jax.random.randint(key, (), 0, len(self.scenes))))
 
-    def step(
-        self, state: EnvState, action: jax.Array, *, execute: jax.Array | bool = True
-    ) -> tuple[EnvState, StepResult]:
-        next_state, result = super().step(state, action, execute=execute)
+    def conclude(self, state: EnvState, plan: Plan, physics: Any) -> tuple[EnvState, StepResult]:
+        next_state, result = super().conclude(state, plan, physics)
         return self._draw(next_state), result
 
     def _draw(self, state: EnvState) -> EnvState:
-        points = jnp.concatenate([state.centroids, state.p1[None]])
+        points = jnp.concatenate([state.centroids[:, :2], state.hand.xy[None]])
         row, col = grid.world_to_cell(points)
         ids = jnp.arange(1, MAX_OBJECTS + 2).astype(jnp.uint8)
         blank = jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8)
         height, instance_ids = (blank.at[row, col].set(x, mode="drop") for x in (100 + ids, ids))
-        return state.replace(obs=Observation(height, instance_ids, state.p1))
+        return state.replace(obs=Observation(height, instance_ids, state.hand))
 
 
 def make_config(**train: Any) -> Config:
@@ -79,13 +69,14 @@ class TinyNetwork(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         return nn.Conv(2, (round(3 * self.width),) * 2, name="conv")(x)
 
-    def q_of_action(self, x: jax.Array, action: jax.Array) -> jax.Array:
-        return jnp.take_along_axis(self(x).reshape(x.shape[0], -1), action[:, None], axis=1)[:, 0]
+    def q_at(self, x: jax.Array, row: jax.Array, col: jax.Array) -> jax.Array:
+        return self(x)[jnp.arange(x.shape[0]), row, col]
 
 
 def make_program(config: Config, env: Any = None, **options: Any) -> program.Program:
-    q_function = QFunction(TinyNetwork(width=config.network.width), input_fn)
-    return program.make_program(env or PictureEnv(), config, q_function=q_function, **options)
+    q_function = QFunction(TinyNetwork(width=config.network.width), ACTIONS, input_fn)
+    scenes: Any = env or PictureEnv()
+    return program.make_program(scenes, config, q_function=q_function, **options)
 
 
 def evaluate(params: Any) -> dict[str, Any]:

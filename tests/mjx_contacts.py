@@ -13,7 +13,7 @@ from mujoco import mjx as mujoco_mjx
 from pregrasp_jax.physics import mjx_model
 from pregrasp_jax.physics.hull_collision import Limits, collide
 from pregrasp_jax.physics.mjx_model import MjxSlotModel
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.types import MAX_OBJECTS
@@ -92,7 +92,7 @@ class Pair(NamedTuple):
 def random_states(model: MjxSlotModel, scenes: SceneBank, num_states: int) -> tuple[np.ndarray, np.ndarray]:
     """Return object ids [S, 8] and qpos [S, nq]: packed and pressed together, or scattered around the arm, in turn."""
     data = mujoco.MjData(model.mj_model)
-    robot.set_home(model.mj_model, data)
+    get_robot("ur5e_rg2").set_home(model.mj_model, data)
     rng = np.random.default_rng(0)
     index = np.arange(num_states) % len(scenes)
     object_ids, qpos = scenes.object_ids[index].copy(), np.tile(data.qpos, (num_states, 1))

@@ -7,11 +7,13 @@ import mujoco
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from pregrasp_jax.physics.base import CTRL_DT
 from pregrasp_jax.physics.mjx_model import make_reference_model
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene import model as slot_model
-from pregrasp_jax.types import MAX_OBJECTS, HullBank
+from pregrasp_jax.spaces.workspace import TABLE
+from pregrasp_jax.types import CTRL_DT, MAX_OBJECTS, HullBank
+
+ROBOT = get_robot("ur5e_rg2")
 
 
 class Touch(NamedTuple):
@@ -27,7 +29,7 @@ class CoarseModel:
     """The native slot model of coarse hulls with MJX's solver options, filled with one scene at a time."""
 
     def __init__(self, bank: HullBank):
-        self.slots = make_reference_model(bank)
+        self.slots = make_reference_model(bank, ROBOT, TABLE)
         self.model = copy.copy(self.slots.mj_model)
 
     def fill(self, object_ids: np.ndarray, poses: np.ndarray) -> mujoco.MjData:
@@ -35,7 +37,7 @@ class CoarseModel:
         empty = MAX_OBJECTS - len(object_ids)
         slot_model.write_slots(self.slots, self.model, np.append(object_ids, np.full(empty, -1)))
         data = mujoco.MjData(self.model)
-        robot.set_home(self.model, data)
+        ROBOT.set_home(self.model, data)
         data.qpos[self.slots.slot_qpos_ids] = np.vstack([poses, slot_model.parking_poses()[len(poses) :]])
         return data
 

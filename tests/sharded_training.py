@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from pregrasp_jax.config import Config, from_dict, to_dict
+from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training import processes, session
 from pregrasp_jax.training.program import Program, TrainState
 from pregrasp_jax.training.sharding import Layout
@@ -35,9 +36,9 @@ EPISODES = (12, 24)
 class CountedEnv(fake_training.PictureEnv):
     """Notes every trace of a push; a physics engine takes seconds to trace."""
 
-    def step(self, state: EnvState, action: jax.Array, **options: Any) -> tuple[EnvState, StepResult]:
+    def conclude(self, state: EnvState, plan: Plan, physics: Any) -> tuple[EnvState, StepResult]:
         TRACES.append(1)
-        return super().step(state, action, **options)
+        return super().conclude(state, plan, physics)
 
 
 def make_config(episodes: int, fused_iterations: int) -> Config:

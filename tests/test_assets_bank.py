@@ -9,7 +9,6 @@ import trimesh
 from pregrasp_jax.assets.bank import (
     ConvexObject,
     concatenate,
-    ineligibility,
     load_bank,
     make_bank,
     save_bank,
@@ -17,6 +16,7 @@ from pregrasp_jax.assets.bank import (
 )
 from pregrasp_jax.assets.catalogue import SEEN, UNSEEN, builtin_bank, process
 from pregrasp_jax.assets.meshes import MIN_TIP_ANGLE, tip_angle
+from pregrasp_jax.robot import closing_region, get_robot
 from pregrasp_jax.types import MAX_HULLS
 
 
@@ -71,15 +71,16 @@ def test_principal_axes_rebuild_the_inertia_of_muJoCo(bank):
 
 
 def test_eligibility_and_its_reason(bank):
-    np.testing.assert_array_equal(bank.eligible, [True, False, True])
-    assert ineligibility(bank, 0) == ""
-    assert "narrowest width 120.0 mm, must be < 105" in ineligibility(bank, 1)
+    eligible, reasons = get_robot("ur5e_rg2").eligibility(bank)
+    np.testing.assert_array_equal(eligible, [True, False, True])
+    assert reasons[0] == reasons[2] == ""
+    assert "narrowest width 120.0 mm, must be < 105" in reasons[1] and "best coverage" in reasons[1]
 
 
 @pytest.mark.parametrize(("coverage", "said"), [(0.96999, "0.969"), (0.9651, "0.965"), (0.5, "0.500")])
-def test_rounding_does_not_hide_why_a_coverage_is_too_small(bank, coverage, said):
-    changed = bank.replace(best_coverage=np.array([coverage] * 3, np.float32))
-    assert ineligibility(changed, 0) == f"best coverage {said}, must be > 0.97"
+def test_rounding_does_not_hide_why_a_coverage_is_too_small(bank, coverage, said, monkeypatch):
+    monkeypatch.setattr(closing_region, "best_coverage", lambda *_, **__: coverage)
+    assert get_robot("ur5e_rg2").eligibility(bank).reasons[0] == f"best coverage {said}, must be > 0.97"
 
 
 def test_select_keeps_every_field_of_the_object_together(bank):
@@ -153,7 +154,7 @@ def test_catalogue_sets():
         assert (np.asarray(catalogue.height) >= 0.11).all()
         assert (np.asarray(catalogue.height) <= 0.30).all()
         assert ((np.asarray(catalogue.mass) > 0.08) & (np.asarray(catalogue.mass) < 0.61)).all()
-        assert np.asarray(catalogue.eligible).mean() > 0.75
+        assert get_robot("ur5e_rg2").eligibility(catalogue).eligible.mean() > 0.75
         assert min(tip_angle(catalogue, i) for i in range(len(catalogue.names))) > MIN_TIP_ANGLE
     assert (np.asarray(seen.object_hulls) >= 0).sum(axis=1).max() >= 4
     with pytest.raises(ValueError, match="'test' is unknown; allowed are seen, unseen"):

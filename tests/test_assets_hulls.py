@@ -6,9 +6,15 @@ import shapely
 import trimesh
 from scipy.spatial import ConvexHull
 
+from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.hulls import make_hulls, polytope, simplify, volume
-from pregrasp_jax.assets.measure import CLOSING_REGION_SIZE, best_coverage, measure, min_width
+from pregrasp_jax.assets.measure import measure, min_width, projection
+from pregrasp_jax.robot import closing_region
+from pregrasp_jax.robot.closing_region import best_coverage
+from pregrasp_jax.robot.ur5e_rg2 import CLOSING_REGION_SIZE, FINGER_OPEN, region
 from pregrasp_jax.types import COARSE_TOPOLOGY, FULL_TOPOLOGY
+
+REGION = region(np.float32(FINGER_OPEN))  # pyright: ignore[reportArgumentType]
 
 
 def cylinder(radius: float = 0.04, height: float = 0.2) -> np.ndarray:
@@ -133,10 +139,10 @@ def test_min_width_is_the_smallest_caliper():
 
 def test_coverage_of_rectangles_by_hand():
     depth, width = CLOSING_REGION_SIZE
-    assert best_coverage(*rectangle(depth - 0.002, width - 0.002)) == 1.0
+    assert best_coverage(*rectangle(depth - 0.002, width - 0.002), REGION) == 1.0
     # Square to the hand, what sticks out is lost: 0.0855 of 0.12 m ahead of the palm, not 0.0855 of it centred.
-    assert best_coverage(*rectangle(0.12, 0.108)) == pytest.approx(0.0855 / 0.108 * 0.11 / 0.12, abs=0.01)
-    assert best_coverage(*rectangle(0.2, 0.2)) < 0.3
+    assert best_coverage(*rectangle(0.12, 0.108), REGION) == pytest.approx(0.0855 / 0.108 * 0.11 / 0.12, abs=0.01)
+    assert best_coverage(*rectangle(0.2, 0.2), REGION) < 0.3
 
 
 def test_coverage_is_the_share_that_shapely_finds():
@@ -149,7 +155,28 @@ def test_coverage_is_the_share_that_shapely_finds():
         turned = shapely.affinity.rotate(shapely.Polygon(outline), -yaw, origin=(0, 0))
         x0, y0, _, y1 = turned.bounds
         middle = (y0 + y1) / 2
-        region = shapely.box(x0, middle - 0.055, x0 + 0.0855, middle + 0.055)
-        best = max(best, turned.intersection(region).area / turned.area)
-    assert best_coverage(cells, outline) == pytest.approx(best, abs=0.005)
+        square = shapely.box(x0, middle - 0.055, x0 + 0.0855, middle + 0.055)
+        best = max(best, turned.intersection(square).area / turned.area)
+    assert best_coverage(cells, outline, REGION) == pytest.approx(best, abs=0.005)
     assert 0.5 < best < 0.95
+
+
+def test_the_search_that_stops_early_finds_the_maximum():
+    """Against every yaw with every cell, over all built-in objects and random polygons; a bound ends it sooner."""
+    rng = np.random.default_rng(5)
+    shapes = [projection(bank, i) for bank in map(builtin_bank, ("seen", "unseen")) for i in range(len(bank.names))]
+    for _ in range(20):
+        points = rng.normal(size=(8, 2)) * rng.uniform(0.02, 0.08, 2)
+        outline = points[ConvexHull(points).vertices]
+        sides = ConvexHull(points).equations
+        cells, _ = rectangle(0.4, 0.4, 2e-3)
+        shapes.append((cells[(cells @ sides[:, :2].T + sides[:, 2] <= 0).all(axis=1)], outline))
+    yaws = np.arange(144) * (2 * np.pi / 144)
+    found = []
+    for cells, outline in shapes:
+        largest = float(closing_region._coverage_at(yaws, cells, outline, REGION).max())
+        assert best_coverage(cells, outline, REGION) == largest
+        enough = best_coverage(cells, outline, REGION, enough=0.97)
+        assert (enough > 0.97) == (largest > 0.97) and enough <= largest
+        found.append(largest)
+    assert min(found) < 0.9 and max(found) == 1.0

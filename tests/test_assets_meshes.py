@@ -22,6 +22,7 @@ from pregrasp_jax.assets.mesh_file import load_mesh
 from pregrasp_jax.assets.meshes import LoadedDir, Note, Refusal, load_object_dir
 from pregrasp_jax.assets.sets import format_table, load_bank_for
 from pregrasp_jax.assets.settings import ObjectSettings, load_settings
+from pregrasp_jax.robot import get_robot
 
 
 @pytest.fixture(autouse=True)
@@ -300,7 +301,8 @@ def test_what_is_refused_of_a_usable_set_is_a_warning(tmp_path):
 
 def test_table_names_objects_and_refusals():
     bank = builtin_bank("seen")
-    table = format_table(LoadedDir(bank, [Refusal("x.stl", "too low")])).splitlines()
+    why_not = get_robot("ur5e_rg2").eligibility(bank).reasons
+    table = format_table(LoadedDir(bank, [Refusal("x.stl", "too low")]), why_not).splitlines()
     assert table[0].split() == ["object", "hulls", "size", "[mm]", "mass", "[kg]", "target"]
     chips = next(line for line in table if line.startswith("ycb_chips_can"))
     assert chips.split()[1:] == ["1", "77", "x", "76", "x", "250", "0.205", "yes"]
@@ -385,5 +387,5 @@ def test_a_folder_of_real_meshes(tmp_path):
     shutil.copytree(folder, tmp_path / "seen")
     bank, refusals, *_ = load_object_dir(tmp_path, "seen")
     assert not refusals
-    assert np.asarray(bank.eligible).mean() > 0.8
+    assert get_robot("ur5e_rg2").eligibility(bank).eligible.mean() > 0.8
     assert min(meshes.tip_angle(bank, i) for i in range(len(bank.names))) > meshes.MIN_TIP_ANGLE

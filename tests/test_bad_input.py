@@ -24,8 +24,8 @@ COMMAND_LINES = [
     ("train", "Expected one of {ci, demo, cpu, paper, resume}"),
     ("train foo", "Unrecognized options: foo (Available subcommands: ci, demo, cpu, paper, resume)"),
     ("train ci", "Missing from", "--run-dir PATH"),
-    ("train ci --run-dir {w}/new --physics.enginee mjx", "--physics.enginee, mjx (--physics.engine {native,mjx,warp})"),
-    ("train ci --run-dir {w}/new --physics.engine bullet", "Expected one of ('native', 'mjx', 'warp')"),
+    ("train ci --run-dir {w}/new --physics.enginee mjx", "--physics.enginee, mjx (--physics.engine {native,mjx})"),
+    ("train ci --run-dir {w}/new --physics.engine bullet", "Expected one of ('native', 'mjx')"),
     ("train ci --run-dir {w}/new --seed 1.5", "Error parsing --seed: invalid literal for int"),
     ("train ci --run-dir {w}/new --replay.hindsight maybe", "'maybe'", "Expected one of ('True', 'False')"),
     ("train ci --run-dir {w}/new --no-replay.hindsight", "Unrecognized options: --no-replay.hindsight (--replay.hind"),
@@ -174,7 +174,7 @@ POLICIES = [
 
 DUMPS = [
     ("pregrasp_jax replay-dump", "Missing from", "PATH file that a training wrote to RUN_DIR/dumps"),
-    ("pregrasp_jax replay-dump {w}/others.npz --engine warp", "invalid choice 'warp'", "'native'"),
+    ("pregrasp_jax replay-dump {w}/others.npz --engine bullet", "invalid choice 'bullet'", "'native'"),
     ("pregrasp_jax replay-dump {w}/others.npz --png {w}", "{w} is a folder; allowed is the name of a file"),
     (
         "pregrasp_jax replay-dump {w}/nothing",
@@ -195,7 +195,7 @@ DUMPS = [
         "); wanted are those of the training: --object-dir",
     ),
     ("pregrasp_jax replay-dump {w}/others.npz --object-dir {w}/nothing", "{w}/nothing: no such folder; allowed is a"),
-    ("pregrasp_jax replay-dump {w}/bullet.npz", "physics.engine = 'bullet' does not exist; allowed: native, mjx, warp"),
+    ("pregrasp_jax replay-dump {w}/bullet.npz", "physics.engine = 'bullet' does not exist; allowed: native, mjx"),
     ("pregrasp_jax replay-dump {w}/builtin.npz", "{w}/builtin.npz: state/physics/", "wanted is a file of RUN_DIR"),
 ]
 

@@ -19,15 +19,16 @@ from report_files import write_evaluation
 import pregrasp_jax
 from pregrasp_jax import io, startup
 from pregrasp_jax.checkpoint import save_policy
-from pregrasp_jax.cli import commands, doctor, film, player, progress
+from pregrasp_jax.cli import commands, doctor, progress
 from pregrasp_jax.cli import evaluate as evaluate_module
 from pregrasp_jax.cli.evaluate import evaluate
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.evaluation.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.config import PRESETS, AssetsConfig, Config, PhysicsConfig, SceneConfig, TaskConfig
+from pregrasp_jax.evaluation import player
 from pregrasp_jax.evaluation.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.learning.networks import QNetwork
 from pregrasp_jax.physics import mjx_version
+from pregrasp_jax.report import play as report_play
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.training import resources
 
@@ -130,7 +131,7 @@ def test_a_trained_policy_keeps_its_task_and_meets_everybodys_scenes(fake_world:
     assert document["camera"] == "pinhole" and document["episodes"] == 3
     state = made.env.reset_to(jax.numpy.int32(0))
     assert made.q_values is not None
-    q = np.where(np.asarray(made.env.action_mask(state.p1))[..., None], made.q_values(state), -np.inf)
+    q = np.where(np.asarray(made.env.action_mask(state.hand)), made.q_values(state), -np.inf)
     assert int(made.policy(state, jax.random.key(0))) == q.argmax()
 
 
@@ -145,7 +146,7 @@ def test_a_smaller_ring_changes_where_the_shipped_policy_may_push_not_what_it_se
     state = usual.env.reset_to(jax.numpy.int32(0))
     assert usual.q_values is not None and narrow.q_values is not None
     np.testing.assert_array_equal(usual.q_values(state), narrow.q_values(state))
-    assert narrow.env.action_mask(state.p1).sum() < usual.env.action_mask(state.p1).sum()
+    assert narrow.env.action_mask(state.hand).sum() < usual.env.action_mask(state.hand).sum()
     with pytest.raises(ValueError, match=r"r_out = 0.25 is out of range; allowed for this policy, .* is 0.04 to 0.2"):
         make_player(EvaluationConfig(policy="pretrained", r_out=0.25))
 
@@ -163,7 +164,7 @@ def test_a_film_shows_the_episodes_that_are_counted(fake_world: list[Config], po
     made = make_player(request)
     rows = run_evaluation(request, made)["rows"]
     assert ends <= {row["reason"] for row in rows}, "or nothing would be said about how these look"
-    play = film.make_play(made, seed=5)
+    play = report_play.make_play(made, seed=5)
     for row in rows:
         *pushes, last = play(row["scene"])
         assert all(decision.ending == "" for decision in pushes) and last.action is None

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fake_env import ACTIONS, hand_at
 
 from pregrasp_jax import heightmap
 from pregrasp_jax.config import PRESETS, NetworkConfig, TaskConfig
@@ -21,13 +22,12 @@ from pregrasp_jax.learning.compact import (
     window_size,
 )
 from pregrasp_jax.learning.networks import num_parameters
-from pregrasp_jax.learning.q_function import make_q_function
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.learning.q_function import QFunction, make_q_function
 from pregrasp_jax.spaces import grid
-from pregrasp_jax.task import push
+from pregrasp_jax.spaces.actions import ActionSpace, Choice
 from pregrasp_jax.types import Observation
 
-START = tuple(robot.START_POSE[:2])
+START = (-0.30, 0.0)
 SIZE = window_size(TaskConfig())
 
 
@@ -36,9 +36,7 @@ def observation(p1) -> Observation:
     rows, cols = np.indices((100, 100))
     ids = np.where(rows < 50, 1, 2) + np.where(cols < 50, 0, 1)
     ids[80:, 80:] = 9
-    return Observation(
-        jnp.asarray((7 * rows + 13 * cols) % 256, jnp.uint8), jnp.asarray(ids, jnp.uint8), jnp.asarray(p1, jnp.float32)
-    )
+    return Observation(jnp.asarray((7 * rows + 13 * cols) % 256, jnp.uint8), jnp.asarray(ids, jnp.uint8), hand_at(p1))
 
 
 @pytest.mark.parametrize("p1", [START, (-0.1025, 0.0525), (0.2475, 0.2475), (-0.2475, -0.2475), (0.0025, -0.1)])
@@ -65,7 +63,7 @@ def test_window_holds_every_cell_of_the_ring(r_out, full_ring):
     size = window_size(task)
     assert size.shape[0] % PATCH == 1 and size.shape[1] % PATCH == 0
     for p1 in (START, (0.0025, 0.0025), (0.1975, -0.2475)):
-        mask = push.half_ring_mask(jnp.array(p1), r_in=task.r_in, r_out=r_out, full_ring=full_ring)
+        mask = grid.half_ring(jnp.array(p1), r_in=task.r_in, r_out=r_out, full=full_ring)
         origin = look_around_hand(observation(p1), jnp.int32(0), size=size).origin
         inside = paste(jnp.ones((*size.shape, 2)), origin)[..., 0]
         assert bool(jnp.all(inside[mask] == 1.0)) and bool(mask.any())
@@ -99,10 +97,10 @@ def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window
     whole = np.asarray(jax.jit(network.apply)(params, window))
     assert whole.shape == (3, 100, 100, 2) and np.ptp(whole) > 0.1
     actions = [
-        grid.encode_action(jnp.int32(r), jnp.int32(c), jnp.int32(a))
-        for r, c, a in ((9, 30, 1), (99, 99, 0), (80, 3, 1))
+        ACTIONS.encode(jnp.int32(r), jnp.int32(c), jnp.int32(a)) for r, c, a in ((9, 30, 1), (99, 99, 0), (80, 3, 1))
     ]
-    taken = jax.jit(functools.partial(network.apply, method="q_of_action"))(params, window, jnp.stack(actions))
+    q = QFunction(network, ACTIONS, functools.partial(look_around_hand, size=SIZE))
+    taken = jax.jit(q.at)(params["params"], window, jnp.stack(actions))
     np.testing.assert_allclose(taken[:2], [whole[0, 9, 30, 1], whole[1, 99, 99, 0]], rtol=1e-5)
     assert taken[2] == whole[2, 80, 3, 1] == 0.0  # left of its window
     assert whole[2, 80, 4, 1] != 0.0
@@ -132,9 +130,9 @@ def test_values_move_with_the_hand_and_the_scene():
     )
     ids = np.zeros((100, 100), np.uint8)
     ids[40:52, 45:60], ids[30:36, 45:50] = 1, 2
-    here = q(Observation(jnp.asarray(30 * ids), jnp.asarray(ids), jnp.array([-0.0525, -0.0025])))
+    here = q(Observation(jnp.asarray(30 * ids), jnp.asarray(ids), hand_at((-0.0525, -0.0025))))
     ids = np.roll(ids, (5, -7), axis=(0, 1))
-    there = q(Observation(jnp.asarray(30 * ids), jnp.asarray(ids), jnp.array([-0.0875, 0.0225])))
+    there = q(Observation(jnp.asarray(30 * ids), jnp.asarray(ids), hand_at((-0.0875, 0.0225))))
     np.testing.assert_allclose(here[40:60, 45:60], np.asarray(there)[45:65, 38:53], atol=1e-5)
 
 
@@ -142,9 +140,9 @@ def test_values_move_with_the_hand_and_the_scene():
 def test_mirrored_scene_gets_mirrored_values(architecture):
     """The reflection is made of the observation by hand: rows are y, so they and the hand's y turn around."""
     obs = observation((-0.1025, 0.0525))
-    reflected = Observation(obs.height[::-1], obs.instance_ids[::-1], obs.p1 * jnp.array([1.0, -1.0]))
+    reflected = Observation(obs.height[::-1], obs.instance_ids[::-1], hand_at((-0.1025, -0.0525)))
     config = NetworkConfig(architecture=architecture, width=1 / 16, mirror=True)
-    q = make_q_function(config, TaskConfig())
+    q = make_q_function(config, TaskConfig(), ACTIONS)
     params = jax.tree.map(
         lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(2), leaf.shape), q.init(jax.random.key(0))
     )
@@ -157,9 +155,9 @@ def test_mirrored_scene_gets_mirrored_values(architecture):
 
 
 def test_augmented_pushes_are_those_of_the_scene_or_of_its_mirror_image():
-    q = make_q_function(NetworkConfig(architecture="compact", width=1 / 16, mirror=True), TaskConfig())
+    q = make_q_function(NetworkConfig(architecture="compact", width=1 / 16, mirror=True), TaskConfig(), ACTIONS)
     obs = observation((-0.1025, 0.0525))
-    reflected = Observation(obs.height[::-1], obs.instance_ids[::-1], obs.p1 * jnp.array([1.0, -1.0]))
+    reflected = Observation(obs.height[::-1], obs.instance_ids[::-1], hand_at((-0.1025, -0.0525)))
     pushes = {False: (obs, 60 * 100 + 40), True: (reflected, 39 * 100 + 40)}  # y = 0.0525 and -0.0525
     inputs = jax.tree.map(lambda leaf: jnp.stack([leaf] * 64), q.input_fn(obs, jnp.int32(1)))
     windows, actions = q.augment(jax.random.key(0), inputs, jnp.full(64, 2 * pushes[False][1] + 1))
@@ -180,26 +178,26 @@ def test_augmented_pushes_are_those_of_the_scene_or_of_its_mirror_image():
 def test_unguided_exploration_stays_where_the_network_has_values_on_both_sides(hand, full_ring):
     """A push without a value would never be learned, and be sampled for ever for its error."""
     config = NetworkConfig(architecture="compact", width=1 / 32, initial_bias=0.2, mirror=True)
-    q = make_q_function(config, TaskConfig(full_ring=full_ring))
+    q = make_q_function(config, TaskConfig(full_ring=full_ring), ACTIONS)
     obs, params = observation(hand), q.init(jax.random.key(0))
     inputs = jax.tree.map(lambda leaf: leaf[None], q.input_fn(obs, jnp.int32(1)))
     assert q.mirror_fn is not None
     here, there = (np.asarray(q.network.apply({"params": params}, x))[0, ..., 0] for x in (inputs, q.mirror_fn(inputs)))
-    np.testing.assert_array_equal(q.domain_fn(obs.p1), (here != 0) & (there[::-1] != 0))
-    mask = push.half_ring_mask(obs.p1, r_in=0.04, r_out=0.2, full_ring=full_ring)
-    assert not (mask & ~q.domain_fn(obs.p1)).any()
+    np.testing.assert_array_equal(q.domain_fn(obs.hand), (here != 0) & (there[::-1] != 0))
+    mask = grid.half_ring(obs.hand.xy, r_in=0.04, r_out=0.2, full=full_ring)
+    assert not (mask & ~q.domain_fn(obs.hand)).any()
 
 
 def test_untrained_it_promises_its_bias_everywhere_and_learns_in_every_layer():
     config = PRESETS["cpu"]
-    q = make_q_function(config.network, config.task)
+    q = make_q_function(config.network, config.task, ACTIONS)
     params = q.init(jax.random.key(0))
     assert num_parameters(params) == 117_922  # also the size that config.py and README name
     values = q.values(params, observation(START), jnp.int32(0))
-    mask = push.half_ring_mask(jnp.asarray(START), r_in=config.task.r_in, r_out=config.task.r_out)
+    mask = grid.half_ring(jnp.asarray(START), r_in=config.task.r_in, r_out=config.task.r_out)
     np.testing.assert_allclose(values[mask], 0.5, atol=0.05)
     inputs = jax.tree.map(lambda x: x[None], q.input_fn(observation((-0.1025, 0.0025)), jnp.int32(0)))
-    gradient = jax.grad(lambda p: q.of_action(p, inputs, jnp.array([2 * (50 * 100 + 50)]))[0])(params)
+    gradient = jax.grad(lambda p: q.at(p, inputs, jnp.array([2 * (50 * 100 + 50)]))[0])(params)
     flat = {"/".join(str(k.key) for k in path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(gradient)}
     silent = {name for name, leaf in flat.items() if not np.any(leaf)}
     assert all(name.startswith("block") and "_in/" in name for name in silent), silent
@@ -208,10 +206,35 @@ def test_untrained_it_promises_its_bias_everywhere_and_learns_in_every_layer():
 def test_paper_and_compact_answer_alike():
     obs = observation((-0.1, 0.0))
     for architecture in ("paper", "compact"):
-        q = make_q_function(NetworkConfig(architecture=architecture, width=1 / 32, initial_bias=0.2), TaskConfig())
+        q = make_q_function(
+            NetworkConfig(architecture=architecture, width=1 / 32, initial_bias=0.2), TaskConfig(), ACTIONS
+        )
         params = q.init(jax.random.key(0))
         values = q.values(params, obs, jnp.int32(0))
         inputs = jax.tree.map(lambda x: x[None], q.input_fn(obs, jnp.int32(0)))
-        action = jnp.array([grid.encode_action(jnp.int32(52), jnp.int32(40), jnp.int32(1))])
-        np.testing.assert_allclose(q.of_action(params, inputs, action)[0], values[52, 40, 1], rtol=1e-4)
+        action = jnp.array([ACTIONS.encode(jnp.int32(52), jnp.int32(40), jnp.int32(1))])
+        np.testing.assert_allclose(q.at(params, inputs, action)[0], values[52, 40, 1], rtol=1e-4)
         assert values.shape == (100, 100, 2) and values.dtype == jnp.float32
+
+
+def test_the_mirror_image_of_a_turned_hand_has_the_other_choice():
+    """Three choices of which two are each other's reflection: values and augmented pushes change places."""
+    made = [Choice(name=str(k), z=0.1, yaw=yaw, aperture=1.0) for k, yaw in enumerate((0.4, 0.0, -0.4))]
+    actions = ActionSpace(tuple(made), mirrored=(2, 1, 0))
+    obs = observation((-0.1025, 0.0525))
+    reflected = Observation(obs.height[::-1], obs.instance_ids[::-1], hand_at((-0.1025, -0.0525)))
+    config = NetworkConfig(architecture="compact", width=1 / 16, mirror=True)
+    q = make_q_function(config, TaskConfig(), actions)
+    params = jax.tree.map(
+        lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(2), leaf.shape), q.init(jax.random.key(0))
+    )
+    alone = dataclasses.replace(q, mirror_fn=None)
+    here, there = (np.asarray(alone.values(params, o, jnp.int32(1))) for o in (obs, reflected))
+    assert here.shape == (100, 100, 3)
+    reach = np.s_[30:90, 30:70]
+    found = np.asarray(q.values(params, obs, jnp.int32(1)))
+    np.testing.assert_allclose(found[reach], ((here + there[::-1, :, ::-1]) / 2)[reach], rtol=1e-4, atol=1e-4)
+    push = int(actions.encode(jnp.int32(60), jnp.int32(40), jnp.int32(0)))
+    inputs = jax.tree.map(lambda leaf: jnp.stack([leaf] * 64), q.input_fn(obs, jnp.int32(1)))
+    _, augmented = q.augment(jax.random.key(0), inputs, jnp.full(64, push))
+    assert set(augmented.tolist()) == {push, 3 * (39 * 100 + 40) + 2}

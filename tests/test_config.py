@@ -54,7 +54,7 @@ def test_a_value_beyond_its_range_is_refused(key):
         ({"replay": {"capacity": True}}, r"replay.capacity = True has the wrong type; allowed: int"),
         ({"replay": {"hindsight": 1}}, r"replay.hindsight = 1 has the wrong type; allowed: bool"),
         ({"replay": 3}, r"replay. must be a mapping, got int"),
-        ({"physics": {"engine": "bullet"}}, r"physics.engine = 'bullet' is unknown; allowed: native, mjx, warp"),
+        ({"physics": {"engine": "bullet"}}, r"physics.engine = 'bullet' is unknown; allowed: native, mjx"),
         ({"assets": {"object_dir": 3}}, r"assets.object_dir = 3 has the wrong type; allowed: str or null"),
         ([], r"config must be a mapping, got list"),
     ],

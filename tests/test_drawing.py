@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from fake_env import ACTIONS, OPEN, hand_at
 from heightmap_oracle import box_cloud, make_instances, pad
 from PIL import Image
 
@@ -11,8 +12,8 @@ from pregrasp_jax import drawing
 from pregrasp_jax.assets.bank import ConvexObject, make_bank, select
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.drawing import shaded
-from pregrasp_jax.spaces import grid
-from pregrasp_jax.types import OPEN, ROBOT_ID, Observation
+from pregrasp_jax.spaces.actions import ActionSpace, Choice
+from pregrasp_jax.types import ROBOT_ID, Observation
 
 SHAPE = (60, 80)
 
@@ -93,11 +94,11 @@ def test_q_map_draws_the_push_where_it_is():
 def test_panel_draws_the_push_on_the_map_of_its_aperture():
     hulls = make_instances([box_cloud((0.0, -0.02, 0), (0.05, 0.02, 0.12))], [1])
     blank = jnp.zeros((100, 100), jnp.uint8)
-    obs = Observation(height=blank, instance_ids=blank, p1=jnp.zeros(2))
-    mask = np.zeros((100, 100), bool)
+    obs = Observation(height=blank, instance_ids=blank, hand=hand_at((-0.2, 0.0)))
+    mask = np.zeros(ACTIONS.shape, bool)
     mask[40:60, 20:40] = True
-    action = int(grid.encode_action(jnp.int32(50), jnp.int32(35), jnp.int32(OPEN)))
-    tiles = functools.partial(drawing.make_tiles, hulls, obs, 0, p1=(-0.2, 0.0), mask=mask)
+    action = int(ACTIONS.encode(jnp.int32(50), jnp.int32(35), jnp.int32(OPEN)))
+    tiles = functools.partial(drawing.make_tiles, hulls, obs, 0, actions=ACTIONS, mask=mask)
     for q_values in (None, np.random.default_rng(0).normal(size=(100, 100, 2))):
         with_push, without = (
             drawing.make_panel(tiles(q_values=q_values, action=chosen), title="test") for chosen in (action, None)
@@ -107,9 +108,28 @@ def test_panel_draws_the_push_on_the_map_of_its_aperture():
         assert changed.min() > with_push.shape[1] - 320
 
 
+def test_of_many_choices_the_best_are_drawn_and_the_chosen_one_among_them():
+    made = [Choice(name=f"held {k}", z=0.1, yaw=0.0, aperture=float(k)) for k in range(7)]
+    actions = ActionSpace(tuple(made), mirrored=tuple(range(7)))
+    hulls = make_instances([box_cloud((0.0, -0.02, 0), (0.05, 0.02, 0.12))], [1])
+    blank = jnp.zeros((100, 100), jnp.uint8)
+    obs = Observation(height=blank, instance_ids=blank, hand=hand_at((-0.2, 0.0)))
+    mask = np.ones(actions.shape, bool)
+    mask[..., 6] = False
+    q_values = np.zeros(actions.shape)
+    q_values[50, 50] = [0.3, 0.1, 0.9, 0.2, 0.8, 0.7, 5.0]  # the largest is not allowed
+    tiles = functools.partial(drawing.make_tiles, hulls, obs, 0, actions=actions, mask=mask, q_values=q_values)
+    worst = int(actions.encode(jnp.int32(50), jnp.int32(60), jnp.int32(1)))
+    shown, chosen = ([caption for caption, _ in tiles(action=action)[3:]] for action in (None, worst))
+    names = [[int(caption.split()[2]) for caption in captions] for captions in (shown, chosen)]
+    best = [2, 4, 5, 0, 3]
+    assert names[0] == sorted(best[: len(names[0])]) and 1 < len(names[0]) < 7
+    assert names[1] == sorted([1, *best[: len(names[0]) - 1]])
+
+
 def test_contact_sheet_shows_every_object():
     bank = select(builtin_bank("seen"), [0, 4])
-    sheet = drawing.contact_sheet(bank, columns=1)
+    sheet = drawing.contact_sheet(bank, np.array([True, False]), columns=1)
     assert sheet.shape[0] == 2 * (sheet.shape[0] // 2)
     for half in np.split(sheet, 2):
         assert color_of(half.astype(float), drawing.OBSTACLE_COLORS[0]).mean() > 0.02

@@ -17,10 +17,10 @@ from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.cli.main import main
 from pregrasp_jax.cli.replay import Replay, make_replay, make_replay_env
 from pregrasp_jax.config import Config, ExplorationConfig
-from pregrasp_jax.physics import make_engine
+from pregrasp_jax.robot.ur5e_rg2 import FINGER_OPEN
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.scene.model import parking_poses
-from pregrasp_jax.task.env import Env
+from pregrasp_jax.task.env import Env, assemble
 from pregrasp_jax.training.dump import load_dump
 from pregrasp_jax.training.mishap import NONE, no_mishap
 from pregrasp_jax.types import MAX_OBJECTS, REASONS
@@ -71,7 +71,7 @@ def env() -> Env:
     poses[:, :2, :3] = [[0.1, -0.1, 0.0], [0.1, 0.1, 0.0]]
     zeros = np.zeros(2, np.int32)
     scenes = SceneBank(ids, poses, zeros.astype(np.float32), zeros, zeros, "train", 2, "made by hand")
-    return Env(Config().task, bank, scenes, make_engine("native", bank, threads=1), Config().task.r_out)
+    return assemble(Config(), bank, scenes, threads=1)
 
 
 def config() -> Config:
@@ -135,8 +135,8 @@ def test_a_dump_repeats_the_push_bit_for_bit(env, dumps, replay, what):
 
 ALTERED = {
     "action": lambda action: action + 2 * (3 + 200 * np.sign(10000 - action)),
-    "state/p1": lambda p1: p1 + 0.02,
-    "state/aperture": lambda aperture: 1 - aperture,
+    "hand/xy": lambda xy: xy + 0.02,
+    "hand/aperture": lambda aperture: FINGER_OPEN - aperture,
     "state/physics/bits": lambda bits: (
         np.roll(bits, 0) + (np.arange(len(bits)) == 2 * (1 + ROBOT_DOFS + 7) + 1) * 2**12
     ),
@@ -205,7 +205,7 @@ def test_a_file_of_numbers_only(dumps):
 
 def test_arrays_that_do_not_fit_are_named(env, dumps, tmp_path):
     dump = load_dump(dumps["flung"])
-    for name, array in (("state/p1", np.zeros(3, np.float32)), ("action", np.float32(3))):
+    for name, array in (("hand/xy", np.zeros(3, np.float32)), ("action", np.float32(3))):
         odd = dataclasses.replace(dump, arrays=dump.arrays | {name: array})
         with pytest.raises(ValueError, match=rf"scene-1\.npz: {name} is float32\["):
             odd.mishap(env)

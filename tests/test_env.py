@@ -14,12 +14,20 @@ import pytest
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import Config, SceneConfig
 from pregrasp_jax.physics import make_engine
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot import get_robot
+from pregrasp_jax.robot.ur5e_rg2 import FINGER_CLOSED, FINGER_OPEN
 from pregrasp_jax.scene.model import hull_points, parking_poses
+from pregrasp_jax.scene.spec import compile_spec, scene_spec
+from pregrasp_jax.spaces.workspace import TABLE
 from pregrasp_jax.task.env import Env, make_env, with_task
-from pregrasp_jax.types import CLOSED, MAX_OBJECTS, OPEN, REASONS, ROBOT_ID, SceneParams
+from pregrasp_jax.types import MAX_OBJECTS, OBSTRUCTIONS, REASONS, ROBOT_ID, SceneParams
 
+ROBOT = get_robot("ur5e_rg2")
 NAMES = builtin_bank("seen").names
+CLOSED, OPEN = 0, 1
+FINGERS = (FINGER_CLOSED, FINGER_OPEN)
+"""Choices of a push, and the drive angle of either."""
+
 START, PALM = np.array([-0.30, 0.0]), -0.0264
 """m: the grasp point at the start, and the palm's face relative to it (MJCF of the RG2)."""
 
@@ -193,7 +201,7 @@ def test_what_is_measured_agrees_with_mujoco_and_numpy(env, pushes, name):
                 centroid, np.asarray(env.bank.com[state.scene.object_ids[slot]], np.float64), seen[3:]
             )
             centroids.append(centroid + seen[:3])
-            np.testing.assert_allclose(state.centroids[slot], centroids[-1][:2], atol=1e-6)
+            np.testing.assert_allclose(state.centroids[slot], centroids[-1], atol=1e-6)
             mujoco.mju_quat2Mat(up, seen[3:])
         start, (*end_xy, end_z) = centroids[0][:2], centroids[1]
         assert outcome.off_table[slot] == (np.abs(end_xy).max() > 0.25 or end_z < 0)
@@ -209,20 +217,23 @@ def test_what_is_measured_agrees_with_mujoco_and_numpy(env, pushes, name):
 
 
 def test_a_push_moves_hand_and_fingers_to_where_it_was_told(pushes):
-    for name, fingers in (("towards the target", robot.FINGER_OPEN), ("with a closed hand", robot.FINGER_CLOSED)):
+    for name, fingers in (("towards the target", FINGER_OPEN), ("with a closed hand", FINGER_CLOSED)):
         after = pushes.after[name]
         np.testing.assert_allclose(after.physics_obs.hand_pose[:3], [-0.2475, 0.0025, 0.1], atol=5e-4)
         np.testing.assert_allclose(after.physics_obs.joint_pos[6:], fingers, atol=0.01)
-        np.testing.assert_allclose(after.p1, [-0.2475, 0.0025], atol=1e-6)
-        assert after.aperture == CASES[name].action[2] and after.num_pushes == 1
-    assert abs(robot.FINGER_OPEN - robot.FINGER_CLOSED) > 0.3
+        np.testing.assert_allclose(after.hand.xy, [-0.2475, 0.0025], atol=1e-6)
+        np.testing.assert_allclose(after.hand.aperture, FINGERS[CASES[name].action[2]], atol=1e-6)
+        assert after.num_pushes == 1 and after.hand.z == np.float32(0.1) and after.hand.yaw == 0
+    assert abs(FINGER_OPEN - FINGER_CLOSED) > 0.3
 
 
 def test_only_an_open_hand_has_a_closing_region(pushes):
     open_hand = pushes.result["target at the palm"].outcome.coverage
     assert open_hand[TARGET] > 0.95 and open_hand[OBSTACLE] == 0
     assert pushes.result["obstacle at the palm"].outcome.coverage[OBSTACLE] > 0.95
-    assert not pushes.result["target at the palm of a closing hand"].outcome.coverage.any()
+    closing = pushes.result["target at the palm of a closing hand"]
+    assert closing.outcome.aperture == FINGER_CLOSED and closing.outcome.coverage[TARGET] > 0.95
+    assert REASONS[closing.reason] == "running", "coverage is measured, and there is no region"
 
 
 @pytest.mark.parametrize("name", ["too long", "not executed"])
@@ -230,7 +241,8 @@ def test_a_push_that_is_not_made_changes_nothing(pushes, name):
     before, after = pushes.before[name], pushes.after[name]
     jax.tree.map(np.testing.assert_array_equal, before, after)
     outcome = pushes.result[name].outcome
-    assert outcome.unreachable
+    assert outcome.unreachable and pushes.result[name].seconds == 0
+    assert OBSTRUCTIONS[outcome.obstruction] == {"too long": "too_long", "not executed": "no_ik"}[name]
     np.testing.assert_array_equal(outcome.distance_before, outcome.distance_after)
     assert pushes.result["too long, and below the table"].outcome.off_table.any()
 
@@ -250,8 +262,8 @@ def test_pushes_follow_one_another_in_one_trace(pushes):
     again, result = unstack(state, CASES), unstack(result, CASES)
     for name in ("towards the target", "with a closed hand"):
         np.testing.assert_allclose(again[name].physics_obs.hand_pose[:2], [-0.1975, 0.0025], atol=5e-4)
-        np.testing.assert_allclose(again[name].physics_obs.joint_pos[6:], robot.FINGER_OPEN, atol=0.01)
-        assert again[name].num_pushes == 2 and again[name].aperture == OPEN
+        np.testing.assert_allclose(again[name].physics_obs.joint_pos[6:], FINGER_OPEN, atol=0.01)
+        assert again[name].num_pushes == 2 and again[name].hand.aperture == np.float32(FINGER_OPEN)
         np.testing.assert_array_equal(result[name].outcome.distance_before, pushes.result[name].outcome.distance_after)
     assert again["too long"].num_pushes == again["not executed"].num_pushes == 1, "the first was not executed"
     assert REASONS[result["nan"].reason] == "nan"
@@ -281,7 +293,7 @@ def test_grasp_holds_the_target_between_the_fingers_and_nothing_else(env, pushes
 def test_a_case_is_seen_where_mujoco_sees_it(env, pushes):
     """Rays from above on the MJCF's robot and the objects; capsules and polyhedra differ at the robot's outline."""
     state = pushes.after["towards the target"]
-    spec = robot.load_spec()
+    spec = scene_spec(ROBOT, TABLE)
     for slot in (TARGET, OBSTACLE):
         body = spec.worldbody.add_body(name=f"slot_{slot}")
         body.add_freejoint()
@@ -289,10 +301,10 @@ def test_a_case_is_seen_where_mujoco_sees_it(env, pushes):
             if hull >= 0:
                 spec.add_mesh(name=f"hull_{hull}").uservert = hull_points(env.bank, hull).ravel()
                 body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"hull_{hull}")
-    mj_model = spec.compile()
+    mj_model = compile_spec(spec)
     data = mujoco.MjData(mj_model)
-    robot.set_home(mj_model, data)
-    data.qpos[robot.joint_qpos_ids(mj_model)] = state.physics_obs.joint_pos
+    ROBOT.set_home(mj_model, data)
+    data.qpos[ROBOT.joint_qpos_ids(mj_model)] = state.physics_obs.joint_pos
     labels = np.full(mj_model.nbody, ROBOT_ID)
     labels[0] = 0
     for slot in (TARGET, OBSTACLE):
@@ -331,7 +343,7 @@ OTHER_CASES = {
 def other(env) -> Pushes:
     heavy = np.where(np.array(NAMES) == "ycb_master_chef_can", 1e4, 1.0).astype(np.float32)
     bank = env.bank.replace(mass=env.bank.mass * heavy, inertia=env.bank.inertia * heavy[:, None])
-    env = dataclasses.replace(env, bank=bank, engine=make_engine("native", bank))
+    env = dataclasses.replace(env, bank=bank, engine=make_engine("native", bank, ROBOT, TABLE))
     return push_all(
         with_task(env, camera="pinhole", max_pushes=1, r_in=0.3, r_out=0.5, obstacles_may_leave=True), OTHER_CASES
     )
@@ -349,7 +361,9 @@ def test_how_a_push_ends_under_another_task(other, name):
 def test_a_stopped_push_was_executed(other):
     after = other.after["stopped"]
     assert 0.01 < np.linalg.norm(after.physics_obs.hand_pose[:2] - [-0.2475, 0.0025]) < 0.06
-    np.testing.assert_allclose(after.p1, [-0.2475, 0.0025], atol=1e-6)
+    np.testing.assert_allclose(after.hand.xy, [-0.2475, 0.0025], atol=1e-6)
+    outcome = other.result["stopped"].outcome
+    assert OBSTRUCTIONS[outcome.obstruction] == "end_error" and other.result["stopped"].seconds > 0.5
 
 
 def test_the_pinhole_sees_the_same_but_for_what_perspective_hides(pushes, other):
@@ -361,8 +375,9 @@ def test_the_pinhole_sees_the_same_but_for_what_perspective_hides(pushes, other)
 
 def test_action_mask_is_the_ring_of_the_task(env):
     for task, ends in ((env, (0.04, 0.2)), (with_task(env, r_in=0.1, r_out=0.2, full_ring=True), (0.1, 0.2))):
-        mask = np.asarray(task.action_mask(jnp.array([0.0025, 0.0025])))
-        rows, cols = np.nonzero(mask)
+        mask = np.asarray(task.action_mask(ROBOT.start.replace(xy=jnp.array([0.0025, 0.0025]))))
+        np.testing.assert_array_equal(mask[..., CLOSED], mask[..., OPEN])
+        rows, cols = np.nonzero(mask[..., OPEN])
         radii = 0.005 * np.hypot(rows - 50, cols - 50)
         np.testing.assert_allclose([radii.min(), radii.max()], ends, atol=1e-6)
         assert cols.min() == (50 if task is env else 10)

@@ -10,13 +10,16 @@ import mujoco
 import numpy as np
 import pytest
 from jax.extend.core import jaxprs_in_params
-from test_env import START, unstack
+from test_env import ROBOT, START, unstack
 
+from pregrasp_jax.assets.bank import select
 from pregrasp_jax.assets.catalogue import builtin_bank
-from pregrasp_jax.config import Config, ExplorationConfig, PhysicsConfig, SceneConfig, TaskConfig
+from pregrasp_jax.config import Config, ExplorationConfig, SceneConfig, TaskConfig
+from pregrasp_jax.spaces.workspace import Box, Workspace
 from pregrasp_jax.task import env as env_module
 from pregrasp_jax.task.env import Env, make_env
-from pregrasp_jax.types import MAX_OBJECTS, OPEN, SceneParams
+from pregrasp_jax.task.rules import make_rules
+from pregrasp_jax.types import MAX_OBJECTS, SceneParams
 
 NAMES = builtin_bank("seen").names
 
@@ -30,7 +33,7 @@ def env() -> Env:
 def choosy(env) -> Env:
     """Few objects are eligible: those that the bank names as targets, and the last, which an id of -1 would mean."""
     named = np.append(env.scenes.object_ids[np.arange(3), env.scenes.target], len(NAMES) - 1)
-    return dataclasses.replace(env, bank=env.bank.replace(eligible=np.isin(np.arange(len(NAMES)), named)))
+    return dataclasses.replace(env, eligible=np.isin(np.arange(len(NAMES)), named))
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +64,7 @@ def test_reset_draws_scene_yaw_and_eligible_target(choosy, resets):
         assert_turned(scenes, scene, index, yaws[-1])
         np.testing.assert_array_equal(state.physics_obs.object_poses, scene.poses)
         targets.add((index, int(scene.target)))
-    eligible = (scenes.object_ids >= 0) & np.asarray(choosy.bank.eligible)[scenes.object_ids]
+    eligible = (scenes.object_ids >= 0) & choosy.eligible[scenes.object_ids]
     assert targets == {(int(i), int(j)) for i, j in np.argwhere(eligible)}, "every eligible target, and no other"
     assert (scenes.object_ids < 0).any()
     assert set(np.floor(np.array(yaws) / (np.pi / 4))) == set(range(-4, 4)), "yaws are drawn from the whole circle"
@@ -77,9 +80,9 @@ def test_a_started_scene_shows_every_object_to_an_open_hand_at_the_start(env):
     for index, state in states.items():
         assert_turned(env.scenes, state.scene, index, float(env.scenes.yaw[index]))
         assert state.scene.target == env.scenes.target[index] and state.scene_index == index
-        np.testing.assert_allclose(state.p1, START, atol=1e-7)
+        np.testing.assert_allclose(state.hand.xy, START, atol=1e-7)
         np.testing.assert_allclose(state.physics_obs.hand_pose, [*START, 0.1, 1, 0, 0, 0], atol=1e-5)
-        assert state.aperture == OPEN and state.num_pushes == 0
+        assert state.hand.aperture == ROBOT.start.aperture and state.num_pushes == 0
         present = {slot + 1 for slot in range(MAX_OBJECTS) if state.scene.object_ids[slot] >= 0}
         assert set(np.unique(state.obs.instance_ids)) == {0} | present, "the fingers end 19 mm before the workspace"
         for slot in present:
@@ -118,5 +121,40 @@ def test_settings_that_cannot_work_are_refused(monkeypatch):
         make_env(Config(scene=SceneConfig(test_scenes=3), task=TaskConfig(r_out=0.05)), split="test")
     make_env(Config(scene=SceneConfig(test_scenes=3), task=TaskConfig(r_out=0.06)), split="test")
     monkeypatch.setattr(env_module.scene_bank, "load_or_build", lambda *_, **__: pytest.fail("packed too early"))
-    with pytest.raises(ValueError, match=r"physics\.engine = 'warp'.*allowed here: native, mjx"):
-        make_env(Config(physics=PhysicsConfig(engine="warp")), split="test")
+    for field, allowed in (("workspace", "table"), ("robot", "ur5e_rg2"), ("primitive", "push")):
+        task = dataclasses.replace(TaskConfig(), **{field: "nowhere"})  # pyright: ignore[reportArgumentType]
+        with pytest.raises(ValueError, match=rf"task\.{field} = 'nowhere' does not exist; allowed: .*{allowed}"):
+            make_env(Config(task=task), split="test")
+
+
+@pytest.mark.parametrize(
+    ("wall", "said"),
+    [
+        (
+            Box(center=(0.3, 0.0, 0.1), half_size=(0.1, 0.4, 0.1)),
+            r"wall 1 comes within 0\.200 m .* is 0\.245",
+        ),
+        (
+            Box(center=(-0.5, 0.0, 0.3), half_size=(0.01, 0.4, 0.3)),
+            r"wall 1 is -?0\.\d+ m from .* is 0\.015",
+        ),
+    ],
+)
+def test_walls_in_the_way_are_refused(wall, said):
+    fine = Box(center=(0.0, 0.6, 0.1), half_size=(0.4, 0.02, 0.1))
+    env_module.refuse_walls(ROBOT, Workspace(name="room", walls=(fine,)))
+    with pytest.raises(ValueError, match=rf"workspace 'room': {said} m or more"):
+        env_module.refuse_walls(ROBOT, Workspace(name="room", walls=(fine, wall)))
+
+
+def test_objects_that_no_hand_can_take_are_refused():
+    bank = builtin_bank("seen")
+    wide = [i for i, why in enumerate(ROBOT.eligibility(bank).reasons) if why]
+    with pytest.raises(ValueError, match=rf"none of {len(wide)} objects .* robot ur5e_rg2; .* narrowest"):
+        env_module.eligible_targets(ROBOT, select(bank, wide))
+
+
+def test_a_robot_without_a_closing_region_has_no_such_rules(env):
+    handless = dataclasses.replace(ROBOT, closing_region=None)
+    with pytest.raises(ValueError, match="robot ur5e_rg2 has no closing region; allowed for primitive push"):
+        make_rules(handless, env.workspace, env.primitive, env.bank, env.task)

@@ -10,15 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fake_env import FakeEnv, fake_env, make_scenes
+from fake_env import ACTIONS, OPEN, FakeEnv, fake_env, make_scenes
 from jax.tree_util import Partial
 
 from pregrasp_jax.config import Config, SceneConfig, TaskConfig
 from pregrasp_jax.evaluation import Episode, EvaluationResult, Evaluator, evaluate_policy, results
 from pregrasp_jax.policies import scripts
-from pregrasp_jax.spaces import grid
+from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.task.env import make_env
-from pregrasp_jax.types import OPEN, REASONS, EnvState, GraspResult, Observation
+from pregrasp_jax.types import REASONS, EnvState, GraspResult, Observation
 
 ENV = fake_env()
 
@@ -35,15 +35,15 @@ def _reference(env: Any, policy: scripts.Policy, episodes: int, seed: int, with_
             total += float(result.reward)
             if REASONS[int(result.reason)] != "unreachable":
                 motions += 1
-                seconds += float(np.linalg.norm(state.p1 - before.p1)) / env.task.push_speed + 0.25
-                seconds += 0.5 * bool(state.aperture != before.aperture)
+                seconds += float(np.linalg.norm(state.hand.xy - before.hand.xy)) / env.task.push_speed + 0.25
+                seconds += 0.5 * bool(state.hand.aperture != before.hand.aperture)
             if result.terminated or result.truncated:
                 break
         reason = REASONS[int(result.reason)]
         if reason == "target_in_region" and with_grasp and not env.grasp(state).held:
             reason = "grasp_failed"
         name = env.bank.names[env.scenes.object_ids[scene, env.scenes.target[scene]]]
-        rows.append(Episode(scene=scene, target=name, reason=reason, motions=motions, return_=total, seconds=seconds))
+        rows.append(_episode(scene, reason, motions, seconds, target=name, return_=total))
     return rows
 
 
@@ -51,9 +51,9 @@ def _reference(env: Any, policy: scripts.Policy, episodes: int, seed: int, with_
 class _Shaky(FakeEnv):
     """Grasps of odd scenes make no sense afterwards; in scene 2 contacts are dropped, and it holds."""
 
-    def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> GraspResult:
+    def conclude_grasp(self, state: EnvState, physics: Any) -> GraspResult:
         odd = state.scene_index % 2 == 1
-        return GraspResult(~odd & execute, odd, jnp.where(state.scene_index == 2, 7, 0))
+        return GraspResult(~odd, odd, jnp.where(state.scene_index == 2, 7, 0))
 
 
 def test_what_happens_during_a_grasp_is_not_silent() -> None:
@@ -139,8 +139,8 @@ def test_success_on_the_last_push_counts(pushes: int, reason: str) -> None:
 
     def crawl(state: EnvState, key: jax.Array) -> jax.Array:
         del key
-        row, col = scripts.nearest_cell(env.action_mask(state.p1), state.p1 + jnp.array([0.04, 0.0]))
-        return grid.encode_action(row, col, jnp.int32(OPEN))
+        ahead = state.hand.xy + jnp.array([0.04, 0.0])
+        return scripts.nearest_action(env.action_mask(state.hand), ahead, jnp.int32(OPEN), ACTIONS)
 
     (episode,) = evaluate_policy(env, crawl, episodes=1).episodes
     assert (episode.reason, episode.motions) == (reason, min(pushes, 10))
@@ -149,8 +149,9 @@ def test_success_on_the_last_push_counts(pushes: int, reason: str) -> None:
 def test_a_refused_push_is_not_a_motion() -> None:
     def step_then_dive(state: EnvState, key: jax.Array) -> jax.Array:
         del key
-        row, col = scripts.nearest_cell(ENV.action_mask(state.p1), jnp.array([-0.18, 0.0]))
-        return grid.encode_action(jnp.where(state.num_pushes < 1, row, 0), col, jnp.int32(0))
+        mask = ENV.action_mask(state.hand)
+        row, col, _ = ACTIONS.unravel(scripts.nearest_action(mask, jnp.array([-0.18, 0.0]), jnp.int32(0), ACTIONS))
+        return ACTIONS.encode(jnp.where(state.num_pushes < 1, row, 0), col, jnp.int32(0))
 
     (episode,) = evaluate_policy(ENV, step_then_dive, episodes=1).episodes
     assert (episode.reason, episode.motions) == ("unreachable", 1)
@@ -176,7 +177,7 @@ def test_new_parameters_do_not_compile_again() -> None:
         traces.append(1)
         return params * jnp.ones((*obs.height.shape, 2))
 
-    make = scripts.make_learned(ENV, q_values)
+    make = make_learned(ENV, q_values)
     evaluator = Evaluator(ENV, num_envs=3)
     for scale in (1.0, 2.0):
         evaluator.run(make(jnp.float32(scale)), episodes=5)
@@ -189,8 +190,9 @@ def test_refuses_more_episodes_than_scenes(episodes: int) -> None:
         evaluate_policy(ENV, scripts.make_straight(ENV), episodes=episodes)
 
 
-def _episode(scene: int, reason: str, motions: int, seconds: float = 1.0) -> Episode:
-    return Episode(scene=scene, target="can", reason=reason, motions=motions, return_=2.0, seconds=seconds)
+def _episode(scene: int, reason: str, motions: int, seconds: float = 1.0, **fields: Any) -> Episode:
+    fields = {"target": "can", "return_": 2.0, "success": reason == "target_in_region"} | fields
+    return Episode(scene=scene, reason=reason, motions=motions, seconds=seconds, **fields)
 
 
 RESULT = EvaluationResult(

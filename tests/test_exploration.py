@@ -6,14 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fake_env import ACTIONS, hand_at
 
 from pregrasp_jax.config import ExplorationConfig
 from pregrasp_jax.policies import exploration
-from pregrasp_jax.spaces import grid
+from pregrasp_jax.spaces.actions import ActionSpace, Choice
 from pregrasp_jax.training.collect import epsilon_at
 
 R_IN, R_OUT = 0.04, 0.15
 P1 = (-0.05, 0.02)
+NUM_ACTIONS = 20_000
 
 
 def ring(*, full: bool = False) -> np.ndarray:
@@ -26,10 +28,15 @@ def ring(*, full: bool = False) -> np.ndarray:
     return mask
 
 
+def both(cells: jax.Array | np.ndarray) -> jax.Array:
+    """Return the mask [H, W, 2] of cells that are allowed with either choice."""
+    return jnp.broadcast_to(jnp.asarray(cells)[..., None], ACTIONS.shape)
+
+
 @functools.partial(jax.jit, static_argnames="angle_std")
 def guided(keys: jax.Array, target: jax.Array, mask: jax.Array, angle_std: float) -> jax.Array:
-    draw_one = functools.partial(exploration.guided_action, angle_std=angle_std, open_probability=0.7)
-    return jax.vmap(draw_one, in_axes=(0, None, None, None))(keys, jnp.array(P1), target, mask)
+    draw_one = functools.partial(exploration.guided_action, actions=ACTIONS, angle_std=angle_std, open_probability=0.7)
+    return jax.vmap(draw_one, in_axes=(0, None, None, None))(keys, hand_at(P1), target, both(mask))
 
 
 def draw(dx: float, dy: float, *, angle_std: float = 0.5, mask: np.ndarray | None = None):
@@ -85,23 +92,24 @@ def test_a_single_allowed_cell_is_found_however_unlikely():
 def test_an_empty_mask_still_gives_an_action():
     action = exploration.guided_action(
         jax.random.key(0),
-        jnp.zeros(2),
+        hand_at((0.0, 0.0)),
         jnp.ones(2),
-        jnp.zeros((100, 100), bool),
+        jnp.zeros(ACTIONS.shape, bool),
+        ACTIONS,
         angle_std=0.5,
         open_probability=0.7,
     )
-    assert 0 <= int(action) < grid.NUM_ACTIONS and action.dtype == jnp.int32
+    assert 0 <= int(action) < NUM_ACTIONS and action.dtype == jnp.int32
 
 
 def test_random_actions_cover_the_whole_map_or_what_the_network_values_of_it():
-    everywhere, keys = jnp.ones((100, 100), bool), jax.random.split(jax.random.key(1), 20_000)
-    draw = jax.jit(jax.vmap(exploration.random_action, (0, None)))
+    everywhere, keys = jnp.ones(ACTIONS.shape, bool), jax.random.split(jax.random.key(1), 20_000)
+    draw = jax.jit(jax.vmap(lambda key, mask: exploration.random_action(key, mask, ACTIONS), (0, None)))
     few = everywhere.at[:, :98].set(False)
     assert set(np.asarray(draw(keys, few)) % 200) == {196, 197, 198, 199}
     actions = np.asarray(draw(keys, everywhere))
-    assert actions.min() < 20 and actions.max() >= grid.NUM_ACTIONS - 20
-    counts, _ = np.histogram(actions, bins=20, range=(0, grid.NUM_ACTIONS))
+    assert actions.min() < 20 and actions.max() >= NUM_ACTIONS - 20
+    counts, _ = np.histogram(actions, bins=20, range=(0, NUM_ACTIONS))
     assert np.all(np.abs(counts - 1000) < 160)
     assert np.mean(actions % 2) == pytest.approx(0.5, abs=0.02)
 
@@ -123,7 +131,7 @@ def test_softmax_action_follows_its_distribution_inside_the_mask():
     mask = np.zeros((100, 100), bool)
     mask[3, 4] = mask[50, 60] = True
     q = jnp.full((100, 100, 2), 9.0).at[3, 4].set(jnp.array([0.1, 0.3])).at[50, 60].set(jnp.array([0.0, 0.2]))
-    draw = jax.vmap(lambda key: exploration.softmax_action(key, q, jnp.asarray(mask), temperature=0.1))
+    draw = jax.vmap(lambda key: exploration.softmax_action(key, q, both(mask), temperature=0.1))
     actions = np.asarray(draw(jax.random.split(jax.random.key(0), 4000)))
     assert actions.dtype == np.int32
     weights = np.exp(np.array([1.0, 3.0, 0.0, 2.0]))
@@ -131,3 +139,48 @@ def test_softmax_action_follows_its_distribution_inside_the_mask():
     shares = [(actions == cell).mean() for cell in cells]
     assert sum(shares) == pytest.approx(1.0)
     np.testing.assert_allclose(shares, weights / weights.sum(), atol=0.03)
+
+
+def choices(*apertures: float) -> ActionSpace:
+    made = [Choice(name=str(k), z=0.1, yaw=0.0, aperture=angle) for k, angle in enumerate(apertures)]
+    return ActionSpace(tuple(made), mirrored=tuple(range(len(made))))
+
+
+@pytest.mark.parametrize(
+    ("apertures", "open_probability", "expected"),
+    [
+        ((0.0, 1.0), 0.7, (0.3, 0.7)),
+        ((1.0, 0.0), 0.7, (0.7, 0.3)),
+        ((0.0, 1.0), None, (0.5, 0.5)),
+        ((0.4,), 0.7, (1.0,)),
+        ((0.4, 0.4, 0.4), 0.7, (1 / 3, 1 / 3, 1 / 3)),
+        ((0.0, 1.0, 0.5, 1.0, 0.0), 0.6, (0.4 / 3, 0.3, 0.4 / 3, 0.3, 0.4 / 3)),
+        ((0.0, 1.0, 0.5, 1.0, 0.0), None, (0.2, 0.2, 0.2, 0.2, 0.2)),
+        ((0.0, 0.5, 1.0), 0.0, (0.5, 0.5, 0.0)),
+        ((0.0, 0.5, 1.0), 1.0, (0.0, 0.0, 1.0)),
+    ],
+)
+def test_choices_of_the_widest_aperture_share_its_probability(apertures, open_probability, expected):
+    draw = functools.partial(exploration.draw_choice, actions=choices(*apertures), open_probability=open_probability)
+    drawn = np.asarray(jax.jit(jax.vmap(lambda key: draw(key)))(jax.random.split(jax.random.key(3), 4000)))
+    assert drawn.dtype == np.int32
+    shares = np.bincount(drawn, minlength=len(apertures)) / len(drawn)
+    np.testing.assert_allclose(shares, expected, atol=0.03)
+    np.testing.assert_array_equal(shares[np.array(expected) == 0], 0)
+
+
+def test_a_cell_is_drawn_among_those_that_the_choice_allows():
+    """Three choices, each allowed in a cell of its own: the cell of another would be a push that is not allowed."""
+    actions = choices(0.0, 0.5, 1.0)
+    cells = np.array([[3, 4], [50, 60], [97, 2]])
+    mask = jnp.zeros(actions.shape, bool).at[cells[:, 0], cells[:, 1], jnp.arange(3)].set(True)
+    keys = jax.random.split(jax.random.key(1), 300)
+    guided = functools.partial(exploration.guided_action, actions=actions, angle_std=0.5, open_probability=0.4)
+    drawn = [
+        jax.vmap(lambda key: exploration.random_action(key, mask, actions))(keys),
+        jax.vmap(lambda key: guided(key, hand_at(P1), jnp.zeros(2), mask))(keys),
+    ]
+    for flat in drawn:
+        row, col, choice = (np.asarray(x) for x in actions.unravel(flat))
+        assert set(choice) == {0, 1, 2}
+        np.testing.assert_array_equal(np.stack([row, col], axis=-1), cells[choice])

@@ -5,12 +5,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fake_env import fake_rules, hand_at, make_outcome
 
+from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.learning import hindsight, replay
-from pregrasp_jax.task.rules import judge
 from pregrasp_jax.types import MAX_OBJECTS, REASONS, Observation, Outcome
 
 MAX_PUSHES = 5
+RULES = fake_rules(TaskConfig())
 
 
 def random_outcome(rng: np.random.Generator, *, enclosed: int | None = None, toppled=()) -> Outcome:
@@ -26,15 +28,16 @@ def random_outcome(rng: np.random.Generator, *, enclosed: int | None = None, top
         "toppled": np.isin(np.arange(MAX_OBJECTS), list(toppled)),
     }
     fields["off_table"] = np.zeros(MAX_OBJECTS, bool)
-    flags = ("unreachable", "no_action", "diverged")
-    return Outcome(**fields, **dict.fromkeys(flags, np.zeros((), bool)))  # pyright: ignore[reportArgumentType]
+    plain = {"aperture": np.float32(1.0), "obstruction": np.int32(0)}
+    plain |= dict.fromkeys(("no_action", "diverged"), np.zeros((), bool))
+    return make_outcome(**fields, **plain)
 
 
 def stack(items):
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *items)
 
 
-compiled_judge = jax.jit(judge)
+compiled_judge = jax.jit(RULES.judge)
 
 
 def loop_relabel(outcomes: list[Outcome], goal: int) -> list[tuple[float, bool]]:
@@ -50,7 +53,7 @@ def loop_relabel(outcomes: list[Outcome], goal: int) -> list[tuple[float, bool]]
 
 def test_relabel_agrees_with_a_plain_loop():
     rng = np.random.default_rng(0)
-    relabel = jax.jit(hindsight.relabel)
+    relabel = jax.jit(functools.partial(hindsight.relabel, RULES))
     lengths = set()
     for trial in range(60):
         length, goal = int(rng.integers(1, MAX_PUSHES + 1)), int(rng.integers(MAX_OBJECTS))
@@ -65,7 +68,8 @@ def test_relabel_agrees_with_a_plain_loop():
         ]
         # Whatever lies behind the end of the episode must not matter.
         behind = [random_outcome(rng, enclosed=goal) for _ in range(MAX_PUSHES - length)]
-        reward, terminated, valid = map(np.asarray, relabel(stack(episode + behind), length, goal))
+        verdicts, valid = jax.device_get(relabel(stack(episode + behind), length, goal))
+        reward, terminated = verdicts.reward, verdicts.terminated
         expected = loop_relabel(episode, goal)
         assert valid.tolist() == [step < len(expected) for step in range(MAX_PUSHES)], trial
         assert list(zip(reward[valid].tolist(), terminated[valid].tolist(), strict=True)) == expected
@@ -87,14 +91,25 @@ ELIGIBLE = np.ones(MAX_OBJECTS, bool)
         ({4: 0.96, 1: 0.99}, {}, ELIGIBLE, None),
         ({4: 0.96}, {"off_table": np.arange(MAX_OBJECTS) == 6}, ELIGIBLE, None),
         ({4: 0.96}, {"no_action": True}, ELIGIBLE, 4),
+        ({4: 0.96}, {"aperture": jnp.float32(0.0)}, ELIGIBLE, None),
     ],
-    ids=["one", "two", "larger not eligible", "not eligible", "at the bound", "target too", "off table", "no action"],
+    ids=[
+        "one",
+        "two",
+        "larger not eligible",
+        "not eligible",
+        "at the bound",
+        "target too",
+        "off table",
+        "no action",
+        "closed hand",
+    ],
 )
 def test_enclosed_obstacle(coverage, flags, eligible, expected):
     result = random_outcome(np.random.default_rng(1))
     shares = np.array([coverage.get(slot, 0.1) for slot in range(MAX_OBJECTS)], np.float32)
     result = result.replace(coverage=shares, **{name: jnp.asarray(value) for name, value in flags.items()})
-    slot, found = hindsight.enclosed_obstacle(result, jnp.int32(1), jnp.asarray(eligible))
+    slot, found = RULES.hindsight_goal(result, jnp.int32(1), jnp.asarray(eligible))
     assert bool(found) == (expected is not None)
     if expected is not None:
         assert int(slot) == expected
@@ -105,20 +120,17 @@ def test_a_bystander_that_left_spoils_no_hindsight_where_obstacles_may_leave():
     result = random_outcome(np.random.default_rng(1), enclosed=enclosed)
     result = result.replace(off_table=np.arange(MAX_OBJECTS) == fallen)
     for may_fall in (False, True):
-        slot, found = hindsight.enclosed_obstacle(
-            result, jnp.int32(target), jnp.asarray(ELIGIBLE), obstacles_may_leave=may_fall
-        )
+        rules = fake_rules(TaskConfig(obstacles_may_leave=may_fall))
+        slot, found = rules.hindsight_goal(result, jnp.int32(target), jnp.asarray(ELIGIBLE))
         assert bool(found) == may_fall and int(slot) == enclosed
         outcomes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], result)
-        reward, terminated, _ = hindsight.relabel(
-            outcomes, jnp.int32(1), jnp.int32(enclosed), obstacles_may_leave=may_fall
-        )
-        assert (float(reward[0]), bool(terminated[0])) == (2.0 if may_fall else 0.0, True)
+        verdicts, _ = hindsight.relabel(rules, outcomes, jnp.int32(1), jnp.int32(enclosed))
+        assert (float(verdicts.reward[0]), bool(verdicts.terminated[0])) == (2.0 if may_fall else 0.0, True)
 
 
 def image(number: int) -> Observation:
     pixels = jnp.array([[number % 256, number // 256]], jnp.uint8)
-    return Observation(pixels, pixels, jnp.zeros(2))
+    return Observation(pixels, pixels, hand_at((0.0, 0.0)))
 
 
 def test_jitted_memory_agrees_with_a_plain_loop_over_the_shipped_judge():
@@ -148,6 +160,7 @@ def test_jitted_memory_agrees_with_a_plain_loop_over_the_shipped_judge():
                     outcome=outcome,
                     reward=reward,
                     terminated=terminated,
+                    reason=reason,
                     truncated=jnp.asarray(truncated),
                     next_obs=image(0),
                 )
@@ -165,7 +178,7 @@ def test_jitted_memory_agrees_with_a_plain_loop_over_the_shipped_judge():
         if memory is None:
             memory = replay.init(steps, capacity=1000, max_pushes=MAX_PUSHES)
             add = jax.jit(
-                lambda memory, steps: hindsight.add_hindsight(replay.add(memory, steps), jnp.asarray(eligible)),
+                lambda memory, steps: hindsight.add_hindsight(replay.add(memory, steps), jnp.asarray(eligible), RULES),
                 donate_argnums=0,
             )
         assert add is not None
@@ -182,12 +195,17 @@ def test_jitted_memory_agrees_with_a_plain_loop_over_the_shipped_judge():
 def test_without_the_call_there_are_no_hindsight_rows():
     rng = np.random.default_rng(0)
     outcome = random_outcome(rng, enclosed=3)
-    reward, terminated, _ = compiled_judge(outcome, jnp.int32(0))
+    reward, terminated, reason = compiled_judge(outcome, jnp.int32(0))
     step = functools.partial(
         replay.Steps, root=jnp.int32(0), obs=image(0), next_obs=image(1), truncated=jnp.asarray(False)
     )
-    steps = stack([step(action=jnp.int32(0), goal=jnp.int32(0), outcome=outcome, reward=reward, terminated=terminated)])
+    judged = {"reward": reward, "terminated": terminated, "reason": reason}
+    steps = stack([step(action=jnp.int32(0), goal=jnp.int32(0), outcome=outcome, **judged)])
     memory = jax.jit(replay.add)(replay.init(steps, capacity=20, max_pushes=MAX_PUSHES), steps)
     assert int(memory.hindsight_rows_written) == 0 and int(memory.num_alive) == 1
     eligible = jnp.ones((1, MAX_OBJECTS), bool)
-    assert int(jax.jit(hindsight.add_hindsight)(memory, eligible).hindsight_rows_written) == 1
+    add_hindsight = jax.jit(functools.partial(hindsight.add_hindsight, rules=RULES))
+    relabelled = add_hindsight(memory, eligible)
+    assert int(relabelled.hindsight_rows_written) == 1
+    assert REASONS[int(relabelled.rows.reason[0])] == "obstacle_in_region"
+    assert REASONS[int(relabelled.rows.reason[1])] == "target_in_region", "as the relabelled goal is judged"

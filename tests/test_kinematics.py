@@ -8,9 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from pregrasp_jax.robot import description, kinematics
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot import description, get_robot, kinematics
+from pregrasp_jax.spaces.workspace import TABLE
 
+ROBOT = get_robot("ur5e_rg2")
 NUM = 400
 BRANCHES = list(itertools.product((1, -1), repeat=3))
 
@@ -27,7 +28,7 @@ def random_joints(seed=0):
 def workspace_poses():
     x, y = np.meshgrid(np.linspace(-0.3, 0.25, 12), np.linspace(-0.25, 0.25, 11))
     poses = np.zeros((x.size, 7), np.float32)
-    poses[:, 0], poses[:, 1], poses[:, 2], poses[:, 3] = x.ravel(), y.ravel(), robot.PUSH_HEIGHT, 1.0
+    poses[:, 0], poses[:, 1], poses[:, 2], poses[:, 3] = x.ravel(), y.ravel(), 0.1, 1.0
     return poses
 
 
@@ -56,7 +57,7 @@ def test_grasp_pose_is_mujocos():
     joints = random_joints()
     poses = np.asarray(grasp_poses(joints))
     for row, pose in zip(joints, poses, strict=True):
-        data.qpos[robot.joint_qpos_ids(mj_model)[:6]] = row
+        data.qpos[ROBOT.joint_qpos_ids(mj_model)[:6]] = row
         mujoco.mj_kinematics(mj_model, data)
         np.testing.assert_allclose(pose[:3], data.site("grasp_point").xpos, atol=1e-6)
         rotation = np.zeros(9)
@@ -125,12 +126,28 @@ def test_wrist_singularity_keeps_the_pose():
     assert error[exists].max() < 1e-4
 
 
-def test_nearest_solution_skips_missing_branches_and_unwraps():
+def test_branches_are_unwrapped_one_by_one_and_missing_ones_stay_missing():
     reference = jnp.array([3.1, 0, 0, 0, 0, 0])
     solutions = jnp.full((8, 6), jnp.nan).at[3].set(jnp.array([-3.1, 0, 0, 0, 0, 0])).at[6].set(jnp.ones(6))
-    found = np.asarray(kinematics.nearest_solution(solutions, reference))
-    np.testing.assert_allclose(found, [2 * np.pi - 3.1, 0, 0, 0, 0, 0], atol=1e-6)
-    assert np.isnan(np.asarray(kinematics.nearest_solution(jnp.full((8, 6), jnp.nan), reference))).all()
+    found = np.asarray(kinematics.unwrap_near(solutions, reference))
+    np.testing.assert_allclose(found[3], [2 * np.pi - 3.1, 0, 0, 0, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(found[6], np.ones(6), atol=1e-6)
+    assert np.isnan(np.delete(found, [3, 6], axis=0)).all()
+
+
+def test_a_path_keeps_the_branch_that_is_nearest_to_the_current_joints():
+    """From every posture of the start pose a short path is followed without a jump, in that posture."""
+    start = np.array([-0.3, 0.0, 0.1, 1, 0, 0, 0], np.float32)
+    path = jnp.asarray(start + np.linspace(0, 0.02, 10)[:, None] * np.eye(7, dtype=np.float32)[0])
+    postures = np.asarray(kinematics.hand_inverse_kinematics(jnp.asarray(start)))
+    follow = jax.jit(lambda joints: ROBOT.follow(joints, path, jnp.zeros(10), TABLE)[0])
+    followed = 0
+    for posture in postures[np.isfinite(postures).all(axis=1)]:
+        controls = np.asarray(follow(jnp.asarray(np.append(posture, [0, 0]), jnp.float32)))[:, :6]
+        np.testing.assert_allclose(controls[0], posture, atol=0.1)
+        assert np.abs(np.diff(controls, axis=0)).max() < 0.2
+        followed += 1
+    assert followed == 8
 
 
 def test_unwrapping_respects_the_limits():

@@ -1,11 +1,17 @@
+from types import SimpleNamespace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from fake_env import hand_at
 
+from pregrasp_jax.config import LearnerConfig
 from pregrasp_jax.learning import learner
 from pregrasp_jax.learning.replay import Batch
+from pregrasp_jax.types import REASONS, HandPose
 
 H, W = 2, 3
 Q = jnp.array([[[1.0, 2.0], [3.0, 9.0], [5.0, 4.0]], [[0.5, -1.0], [8.0, 7.0], [-2.0, 6.0]]])
@@ -22,19 +28,25 @@ Q = jnp.array([[[1.0, 2.0], [3.0, 9.0], [5.0, 4.0]], [[0.5, -1.0], [8.0, 7.0], [
     ],
 )
 def test_best_allowed_push(cells, value, action):
-    mask = jnp.zeros((H, W), bool).at[tuple(zip(*cells, strict=True))].set(True)
+    mask = jnp.zeros((H, W, 2), bool).at[tuple(zip(*cells, strict=True))].set(True)
     assert float(learner.max_q(Q, mask)) == value
     assert int(learner.greedy_action(Q, mask)) == action
 
 
 def test_negative_values_are_not_replaced_by_a_masked_zero():
-    mask = jnp.zeros((H, W), bool).at[0, 0].set(True)
+    mask = jnp.zeros((H, W, 2), bool).at[0, 0].set(True)
     assert float(learner.max_q(-Q, mask)) == -1.0
     assert int(learner.greedy_action(-Q, mask)) == 0
 
 
+def test_a_choice_that_is_not_allowed_is_not_taken():
+    mask = jnp.zeros((H, W, 2), bool).at[0, 1, 0].set(True).at[1, 2].set(True)
+    assert float(learner.max_q(Q, mask)) == 6.0, "9 is the other choice of the first cell"
+    assert int(learner.greedy_action(Q, mask)) == 11
+
+
 def test_empty_half_ring_is_worth_nothing():
-    empty = jnp.zeros((H, W), bool)
+    empty = jnp.zeros((H, W, 2), bool)
     assert float(learner.max_q(Q, empty)) == 0.0
     assert int(learner.greedy_action(Q, empty)) == 0
     with jax.debug_nans(True):
@@ -80,6 +92,19 @@ def tabular(params, inputs):
     return params[inputs[:, 0, 0, 0].astype(jnp.int32)]
 
 
+def tabular_at(params, inputs, action):
+    return tabular(params, inputs).reshape(len(action), -1)[jnp.arange(len(action)), action]
+
+
+def table(apply=tabular) -> Any:
+    """Return the Q-function of a table, on a grid of H x W cells."""
+    return SimpleNamespace(apply=apply, at=tabular_at)
+
+
+SUCCESS = REASONS.index("target_in_region")
+OPTIONS: dict[str, Any] = {"successes": (SUCCESS,), "config": LearnerConfig()}
+
+
 def state_input(states) -> jax.Array:
     states = jnp.asarray(states, jnp.float32)
     return jnp.broadcast_to(states[:, None, None, None], (len(states), H, W, 2))
@@ -93,7 +118,8 @@ def make_batch(states, next_states, **changes) -> Batch:
         "action": jnp.zeros(size, jnp.int32),
         "reward": jnp.zeros(size),
         "terminated": jnp.zeros(size, bool),
-        "next_p1": jnp.zeros((size, 2)),
+        "reason": jnp.zeros(size, jnp.int32),
+        "next_hand": hands([(0.0, 0.0)] * size),
         "importance_weights": jnp.ones(size),
         "hindsight": jnp.zeros(size, bool),
         "rows": jnp.arange(size),
@@ -101,15 +127,19 @@ def make_batch(states, next_states, **changes) -> Batch:
     return Batch(**(fields | changes))
 
 
-def first_row(p1):
+def hands(points) -> HandPose:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(hand_at(point) for point in points))
+
+
+def first_row(hand):
     """A half ring of a kind: row 0 only, or nothing where x is 9."""
-    return (jnp.arange(H) == 0)[:, None] & jnp.ones((1, W), bool) & (p1[0] != 9.0)
+    return (jnp.arange(H) == 0)[:, None, None] & jnp.ones((1, W, 2), bool) & (hand.xy[0] != 9.0)
 
 
 def run_update(params, batch, optimizer=None, **options):
     optimizer = optimizer or optax.sgd(1.0)
     state = learner.init(params, optimizer)
-    options = {"apply_fn": tabular, "mask_fn": first_row, "optimizer": optimizer} | options
+    options = OPTIONS | {"q": table(), "mask_fn": first_row, "optimizer": optimizer} | options
     return learner.update(state, batch, **options)
 
 
@@ -122,7 +152,8 @@ def test_update_by_hand(compiled):
         action=jnp.array([3, 10, 0], jnp.int32),
         reward=jnp.array([0.5, 2.0, 0.0]),
         terminated=jnp.array([False, True, False]),
-        next_p1=jnp.array([[0.0, 0.0], [0.0, 0.0], [9.0, 0.0]]),
+        reason=jnp.array([0, SUCCESS, REASONS.index("off_table")]),
+        next_hand=hands([(0.0, 0.0), (0.0, 0.0), (9.0, 0.0)]),
         importance_weights=jnp.array([1.0, 0.5, 0.25]),
         hindsight=jnp.array([True, False, False]),
     )
@@ -152,7 +183,7 @@ def test_update_by_hand(compiled):
 def test_targets_come_from_the_target_network():
     optimizer = optax.sgd(0.0)
     state = learner.init(jnp.zeros((1, H, W, 2)), optimizer).replace(target_params=Q[None])
-    options = {"apply_fn": tabular, "mask_fn": first_row, "optimizer": optimizer}
+    options = OPTIONS | {"q": table(), "mask_fn": first_row, "optimizer": optimizer}
     _, errors, _ = learner.update(state, make_batch([0], [0]), **options)
     assert float(errors[0]) == -4.5
 
@@ -170,7 +201,7 @@ def test_init_copies_so_that_a_donated_state_stays_valid():
     optimizer = optax.sgd(1.0)
     state = learner.init(params, optimizer)
     step = jax.jit(
-        lambda s, b: learner.update(s, b, apply_fn=tabular, mask_fn=first_row, optimizer=optimizer),
+        lambda s, b: learner.update(s, b, q=table(), mask_fn=first_row, optimizer=optimizer, **OPTIONS),
         donate_argnums=0,
     )
     state, _, _ = step(state, make_batch([0], [0]))
@@ -185,8 +216,14 @@ def test_one_trace():
         traces.append(inputs.shape)
         return tabular(params, inputs)
 
+    def counted_at(params, inputs, action):
+        traces.append(inputs.shape)
+        return tabular_at(params, inputs, action)
+
     optimizer = optax.adam(1e-3)
-    step = jax.jit(lambda s, b: learner.update(s, b, apply_fn=counted, mask_fn=first_row, optimizer=optimizer))
+    q = SimpleNamespace(apply=counted, at=counted_at)
+    options = OPTIONS | {"q": q, "mask_fn": first_row, "optimizer": optimizer}
+    step = jax.jit(lambda s, b: learner.update(s, b, **options))
     state = learner.init(jnp.zeros((2, H, W, 2)), optimizer)
     state, _, _ = step(state, make_batch([0, 1], [1, 0]))
     num_traces = len(traces)
@@ -197,6 +234,8 @@ def test_one_trace():
 
 def test_shapes_are_checked():
     with pytest.raises(AssertionError, match="expected"):
-        learner.max_q(Q, jnp.ones((W, H), bool))
+        learner.max_q(Q, jnp.ones((W, H, 2), bool))
+    with pytest.raises(AssertionError, match="expected"):
+        learner.max_q(Q, jnp.ones((H, W), bool))
     with pytest.raises(AssertionError, match="expected scalars"):
         learner.td_error(jnp.zeros(3), jnp.zeros(3))

@@ -6,15 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mjx_oracle import CoarseModel
+from mjx_oracle import ROBOT, CoarseModel
 from mujoco import mjx as mujoco_mjx
 
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.physics import mjx, mjx_model
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot.ur5e_rg2 import FINGER_CLOSED
 from pregrasp_jax.scene.model import parking_poses
-from pregrasp_jax.task import push
-from pregrasp_jax.types import CLOSED, MAX_HULLS, MAX_OBJECTS, OPEN, SceneParams
+from pregrasp_jax.spaces.workspace import TABLE
+from pregrasp_jax.task.primitive import Stroke
+from pregrasp_jax.task.push import num_push_rows, plan_push
+from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, SceneParams
 
 NUM_SLOTS = 3
 SCENES = ((0, 3, 1), (13, 8, -1))
@@ -39,7 +41,7 @@ def oracle(bank):
 
 @pytest.fixture(scope="module")
 def engine(bank):
-    return mjx.make_engine(bank, num_slots=NUM_SLOTS, num_hulls=MAX_HULLS)
+    return mjx.make_engine(bank, ROBOT, TABLE, num_slots=NUM_SLOTS, num_hulls=MAX_HULLS)
 
 
 def row_of(bank, object_ids) -> SceneParams:
@@ -59,26 +61,17 @@ def row_of(bank, object_ids) -> SceneParams:
 @pytest.fixture(scope="module")
 def plans():
     """Pushes of 10 and 7 cm with closed fingers."""
-    home = jnp.asarray(robot.home_joint_pos()[:6])
+    start = jax.tree.map(jnp.asarray, ROBOT.start)
     ends = ((-0.2, 0.0), (-0.23, 0.01))
-    rows = push.num_push_rows(0.1, 0.1)
-    return [
-        push.plan_push(
-            home,
-            jnp.asarray(robot.START_POSE[:2]),
-            jnp.asarray(end),
-            jnp.int32(OPEN),
-            jnp.int32(CLOSED),
-            push_speed=0.1,
-            num_rows=rows,
-        )
-        for end in ends
-    ]
+    rows = num_push_rows(0.1, 0.1)
+    strokes = [Stroke(start, start.replace(xy=jnp.array(end), aperture=jnp.float32(FINGER_CLOSED))) for end in ends]
+    home = jnp.asarray(ROBOT.home)
+    return [plan_push(ROBOT, TABLE, home, stroke, push_speed=0.1, num_rows=rows) for stroke in strokes]
 
 
 def test_kinematics_are_those_of_mjx_with_levels_that_are_not_fused(bank):
     """Every field, for a random posture; unfused, lest a pose is computed again and again (2.8 times the step)."""
-    m = mjx_model.make_mjx_slot_model(bank, limits=mjx.LIMITS, num_slots=NUM_SLOTS).mjx_model
+    m = mjx_model.make_mjx_slot_model(bank, ROBOT, TABLE, limits=mjx.LIMITS, num_slots=NUM_SLOTS).mjx_model
     start = mujoco_mjx.make_data(m)
     data = start.replace(qpos=start.qpos + jnp.asarray(np.random.default_rng(0).normal(0, 0.3, m.nq), jnp.float32))
     functions = mjx.kinematics, mujoco_mjx.kinematics
@@ -129,7 +122,7 @@ def test_a_push_moves_objects_as_c_does(bank, oracle, engine, plans, pushed):
         error = np.linalg.norm(np.asarray(seen.object_poses)[i, :count, :3] - reference[:count, :3], axis=1)
         assert moved.min() > 0.01
         assert error.max() < NEAR[i], (moved, error)
-        np.testing.assert_allclose(seen.joint_pos[i], data.qpos[robot.joint_qpos_ids(oracle.model)], atol=2e-3)
+        np.testing.assert_allclose(seen.joint_pos[i], data.qpos[ROBOT.joint_qpos_ids(oracle.model)], atol=2e-3)
     assert not seen.diverged.any()
     assert not after.overflows.any()
     assert after.max_contacts.min() > 4
@@ -208,7 +201,7 @@ def test_a_scene_with_more_objects_than_slots_is_marked(bank, engine):
 def test_three_thousand_steps_do_not_hang(engine, plans, pushed):
     """On two cores MJX programs deadlock unless the package has raised NPROC (9 of 9 runs hung within 103 steps)."""
     run, _, state, _ = pushed
-    hold = jnp.broadcast_to(jnp.asarray(robot.home_joint_pos()[:7]), (2, *plans[0].ctrl.shape))
+    hold = jnp.broadcast_to(jnp.asarray(ROBOT.home[:7]), (2, *plans[0].ctrl.shape))
     rows = plans[0].ctrl.shape[0]
     steps = 0
     while steps < 3000:

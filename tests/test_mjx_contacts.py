@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from mjx_contacts import ALIKE, AMPLE, UNIQUE, Pair, make_contacts_of, random_states, touching_pairs
-from mjx_oracle import CoarseModel
+from mjx_oracle import ROBOT, CoarseModel
 from mujoco import mjx as mujoco_mjx
 
 from pregrasp_jax.assets.catalogue import builtin_bank
@@ -17,6 +17,7 @@ from pregrasp_jax.physics.base import MAX_PENETRATION
 from pregrasp_jax.physics.hull_collision import ContactCounts, Limits
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses
+from pregrasp_jax.spaces.workspace import TABLE
 from pregrasp_jax.types import MAX_OBJECTS
 
 NUM_STATES = 100
@@ -37,7 +38,7 @@ def bank():
 
 @pytest.fixture(scope="module")
 def model(bank):
-    return mjx_model.make_mjx_slot_model(bank, limits=AMPLE)
+    return mjx_model.make_mjx_slot_model(bank, ROBOT, TABLE, limits=AMPLE)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_c_gets_the_options_of_mjx(model, oracle):
 
 @pytest.fixture(scope="module")
 def scenes(bank):
-    return scene_bank.load_or_build(bank, SceneConfig(test_scenes=3), "test")
+    return scene_bank.load_or_build(bank, ROBOT.eligibility(bank).eligible, SceneConfig(test_scenes=3), "test")
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +189,7 @@ def test_a_slot_has_the_constants_of_a_separately_filled_model(model, oracle):
 def test_the_least_overlapping_pairs_and_the_shallowest_contacts_are_dropped(bank, model, oracle, contacts_of, scenes):
     """Limits below the real counts, against the boxes of C's geoms and the contacts of which nothing was dropped."""
     object_ids, qpos = random_states(model, scenes, NUM_TIGHT)
-    tight_model = mjx_model.make_mjx_slot_model(bank, limits=TIGHT)
+    tight_model = mjx_model.make_mjx_slot_model(bank, ROBOT, TABLE, limits=TIGHT)
     everything, _ = contacts_of(object_ids, jnp.asarray(qpos, jnp.float32))
     left, counts = make_contacts_of(tight_model)(object_ids, jnp.asarray(qpos, jnp.float32))
     dropped = np.zeros(3, int)

@@ -1,16 +1,18 @@
-"""What the `mjx` and `warp` engines refuse, in one line each, before anything compiles."""
+"""What the `mjx` engine refuses, in one line each, before anything compiles."""
 
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from pregrasp_jax.assets.bank import select
 from pregrasp_jax.assets.catalogue import builtin_bank
-from pregrasp_jax.physics import make_engine, mjx, mjx_version, warp
+from pregrasp_jax.physics import make_engine, mjx, mjx_version
+from pregrasp_jax.robot import get_robot
+from pregrasp_jax.spaces.workspace import TABLE
 
+ROBOT = get_robot("ur5e_rg2")
 ROOT = Path(__file__).parent.parent
 
 
@@ -21,9 +23,9 @@ def bank():
 
 def test_what_does_not_fit_is_refused_in_one_line(bank):
     with pytest.raises(ValueError, match=r"object '.*' has 6 hulls; a slot of the mjx engine holds 1 to 5"):
-        mjx.make_engine(bank, num_hulls=5)
+        mjx.make_engine(bank, ROBOT, TABLE, num_hulls=5)
     with pytest.raises(ValueError, match="num_slots = 9; allowed are 1 to 8"):
-        mjx.make_engine(bank, num_slots=9)
+        mjx.make_engine(bank, ROBOT, TABLE, num_slots=9)
 
 
 def test_another_mjx_is_refused_by_name():
@@ -35,29 +37,9 @@ def test_another_mjx_is_refused_by_name():
 
 
 def test_the_engine_is_chosen_by_name(bank):
-    assert make_engine("mjx", select(bank, [0, 3])).name == "mjx"
-    with pytest.raises(ValueError, match=r"physics\.engine = 'bullet' does not exist; allowed: native, mjx, warp"):
-        make_engine("bullet", bank)
-
-
-@pytest.mark.parametrize(
-    ("installed", "platform", "said"),
-    [
-        (
-            False,
-            "gpu",
-            r"needs warp-lang: pip install 'pregrasp_jax\[warp\]', .* 3\.17\.0 does not have; allowed",
-        ),
-        (True, "cpu", r"needs an NVIDIA GPU, and jax sees only cpu: pip install 'jax\[cuda12\]'"),
-        (True, "gpu", r"MJX-Warp of mujoco-mjx 3\.17\.0 cannot give every scene its own meshes"),
-    ],
-)
-def test_warp_says_what_is_missing(monkeypatch, bank, installed, platform, said):
-    monkeypatch.setattr(warp.importlib.util, "find_spec", lambda _: object() if installed else None)
-    monkeypatch.setattr(warp.jax, "devices", lambda: [SimpleNamespace(platform=platform)])
-    with pytest.raises(ValueError, match=said) as error:
-        make_engine("warp", bank)
-    assert "\n" not in str(error.value)
+    assert make_engine("mjx", select(bank, [0, 3]), ROBOT, TABLE).name == "mjx"
+    with pytest.raises(ValueError, match=r"physics\.engine = 'bullet' does not exist; allowed: native, mjx"):
+        make_engine("bullet", bank, ROBOT, TABLE)
 
 
 def test_nothing_is_printed_about_warp():

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fake_env import ACTIONS
 from fake_training import TinyNetwork, input_fn
 
 from pregrasp_jax.assets.catalogue import builtin_bank
@@ -21,16 +22,19 @@ from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.physics import mjx, native
 from pregrasp_jax.physics.base import Engine
 from pregrasp_jax.policies import scripts
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses
-from pregrasp_jax.task.env import Env
+from pregrasp_jax.spaces.workspace import TABLE
+from pregrasp_jax.task.env import Env, assemble
 from pregrasp_jax.training import collect, program
 from pregrasp_jax.training.mishap import NONE
-from pregrasp_jax.types import MAX_OBJECTS, OPEN, REASONS, SceneParams
+from pregrasp_jax.types import MAX_OBJECTS, REASONS, SceneParams
 
+ROBOT = get_robot("ur5e_rg2")
 ROOT = Path(__file__).parent.parent
 NUM_SLOTS = 3
+SUCCESSES = (REASONS.index("target_in_region"),)
 FEW = SceneConfig(min_objects=2, max_objects=NUM_SLOTS, train_scenes=4)
 
 
@@ -50,25 +54,20 @@ class Training(NamedTuple):
 def make_env(num_slots: int, scenes: SceneConfig, traces: list[int] | None = None, engine: Engine | None = None) -> Env:
     """Return the environment of the ci preset on packed scenes, on MJX; `traces` notes every trace of a push."""
     bank = builtin_bank("seen")
-    engine = engine or mjx.make_engine(bank, num_slots=num_slots)
+    engine = engine or mjx.make_engine(bank, ROBOT, TABLE, num_slots=num_slots)
 
     def counted(state, ctrl, num_ctrl):
         if traces is not None:
             traces.append(1)
         return engine.run(state, ctrl, num_ctrl)
 
-    return Env(
-        task=Config().task,
-        bank=bank,
-        scenes=scene_bank.load_or_build(bank, scenes, "train"),
-        engine=dataclasses.replace(engine, run=counted),
-        max_distance=Config().task.r_out,
-    )
+    packed = scene_bank.load_or_build(bank, ROBOT.eligibility(bank).eligible, scenes, "train")
+    return dataclasses.replace(assemble(Config(), bank, packed), engine=dataclasses.replace(engine, run=counted))
 
 
 def make_program(env: Env) -> program.Program:
     """Return the program of the ci preset, two iterations in one."""
-    q_function = QFunction(TinyNetwork(), input_fn)  # what is compiled here is long enough without a real one
+    q_function = QFunction(TinyNetwork(), ACTIONS, input_fn)  # what is compiled here is long enough without a real one
     config = dataclasses.replace(PRESETS["ci"], train=dataclasses.replace(PRESETS["ci"].train, fused_iterations=2))
     return program.make_program(env, config, q_function=q_function)
 
@@ -100,7 +99,7 @@ def training() -> Training:
 
 def test_two_iterations_push_remember_and_update(training):
     before, after = training.before, training.after
-    report = collect.report(after.actors.tally)
+    report = collect.metrics(after.actors.tally, SUCCESSES)
     assert report["env_steps"] == 4 and report["physics/overflows"] == 0 and report["reasons/nan"] == 0
     assert int(after.learning.learner.gradient_steps) == 2
     assert np.isfinite(after.learning.metrics["train/loss"])
@@ -117,7 +116,7 @@ def test_a_scene_that_diverges_ends_alone_is_counted_and_starts_anew(training):
     broken = states.replace(physics=states.physics.replace(qpos=states.physics.qpos.at[0, -1].set(jnp.nan)))
     state = training.before.replace(actors=training.before.actors.replace(env_states=broken))
     after = training.iterate(jax.tree.map(jnp.copy, state), np.zeros(2, np.int32), np.zeros(2, np.float32))
-    report = collect.report(after.actors.tally)
+    report = collect.metrics(after.actors.tally, SUCCESSES)
     assert report["reasons/nan"] == 1 and report["physics/diverged"] == 1 and report["episodes"] >= 1
     kept, before = after.actors.mishap, state.actors.env_states.physics
     assert (int(kept.scene), int(kept.branch), int(kept.env_steps)) == (0, 0, 2) and bool(kept.seen.diverged)
@@ -162,7 +161,7 @@ def test_twenty_pushes_on_four_packed_scenes_with_automatic_resets(full_env):
     for _ in range(20):
         actors, _ = push(actors, params)
         sizes.append(sum(x.nbytes for x in jax.live_arrays()))
-    report = collect.report(actors.tally)
+    report = collect.metrics(actors.tally, SUCCESSES)
     assert report["env_steps"] == 80 and report["episodes"] > 4
     assert report["reasons/nan"] == 0 and report["physics/overflows"] == 0
     assert np.isfinite(actors.env_states.physics.qpos).all()
@@ -174,14 +173,14 @@ def test_the_fingers_hold_a_can_and_not_the_air():
     """A cylinder of 78 mm, 1 mm from the palm, closed upon, lifted and held; beside it one out of reach."""
     env = make_env(NUM_SLOTS, FEW)
     can = env.bank.names.index("kit_salt_cylinder")
-    palm = robot.START_POSE[0] - 0.0264
+    palm = ROBOT.start.xy[0] - 0.0264
     states = []
     for x in (palm + 0.001 + 0.039, palm + 0.3):
         poses = parking_poses().astype(np.float32)
         poses[0, :3] = x, 0.0, 0.0
         ids = np.append(can, np.full(MAX_OBJECTS - 1, -1)).astype(np.int32)
         states.append(env.start(SceneParams(jnp.asarray(ids), jnp.asarray(poses), jnp.int32(0))))
-    assert all(int(state.aperture) == OPEN for state in states)
+    assert all(state.hand.aperture == ROBOT.start.aperture for state in states)
     grasps = jax.jit(jax.vmap(env.grasp))(jax.tree.map(lambda *x: jnp.stack(x), *states))
     np.testing.assert_array_equal(grasps.held, [True, False])
     assert not grasps.diverged.any() and not grasps.overflows.any()

@@ -8,26 +8,34 @@ import pytest
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import SceneConfig
 from pregrasp_jax.physics import make_engine
-from pregrasp_jax.physics.base import CTRL_DT, Engine
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.physics.base import Engine
+from pregrasp_jax.physics.native import widen_bits
+from pregrasp_jax.robot import get_robot
+from pregrasp_jax.robot.ur5e_rg2 import FINGER_OPEN
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses
-from pregrasp_jax.task import push
-from pregrasp_jax.types import OPEN, SceneParams
+from pregrasp_jax.spaces.workspace import TABLE
+from pregrasp_jax.task.primitive import Stroke, minimum_jerk
+from pregrasp_jax.task.push import num_push_rows, plan_push
+from pregrasp_jax.types import CTRL_DT, SceneParams
+
+ROBOT = get_robot("ur5e_rg2")
+START, PUSH_HEIGHT = (-0.30, 0.0), 0.1
 
 ENDS = ((-0.2, 0.0), (-0.25, 0.1), (-0.15, 0.0))
-NUM_ROWS = push.num_push_rows(0.15, 0.1)
+NUM_ROWS = num_push_rows(0.15, 0.1)
 
 
 @pytest.fixture(scope="module")
 def engine() -> Engine:
-    return make_engine("native", builtin_bank("seen"))
+    return make_engine("native", builtin_bank("seen"), ROBOT, TABLE)
 
 
 @pytest.fixture(scope="module")
 def scenes():
     config = SceneConfig(test_scenes=3)
-    return scene_bank.load_or_build(builtin_bank("seen"), config, "test")
+    bank = builtin_bank("seen")
+    return scene_bank.load_or_build(bank, ROBOT.eligibility(bank).eligible, config, "test")
 
 
 def empty_scene() -> SceneParams:
@@ -42,19 +50,13 @@ def packed_scene(scenes, index) -> SceneParams:
 
 @jax.jit
 def plan(joints, start, end):
-    return push.plan_push(
-        joints,
-        jnp.asarray(start),
-        jnp.asarray(end),
-        jnp.int32(OPEN),
-        jnp.int32(OPEN),
-        push_speed=0.1,
-        num_rows=NUM_ROWS,
-    )
+    hand = jax.tree.map(jnp.asarray, ROBOT.start)
+    stroke = Stroke(hand.replace(xy=jnp.asarray(start)), hand.replace(xy=jnp.asarray(end)))
+    return plan_push(ROBOT, TABLE, joints, stroke, push_speed=0.1, num_rows=NUM_ROWS)
 
 
 def push(engine, state, start, end, num_ctrl=None):
-    planned = plan(engine.observe(state).joint_pos[:6], start, end)
+    planned = plan(engine.observe(state).joint_pos, start, end)
     return engine.run(state, planned.ctrl, planned.num_ctrl if num_ctrl is None else num_ctrl)
 
 
@@ -62,27 +64,27 @@ def test_reset_puts_everything_where_the_scene_says(engine, scenes):
     scene = packed_scene(scenes, 0)
     seen = engine.observe(engine.reset(engine.init(), scene))
     np.testing.assert_array_equal(seen.object_poses, scene.poses)
-    np.testing.assert_allclose(seen.hand_pose, [*robot.START_POSE], atol=1e-5)
-    np.testing.assert_allclose(seen.joint_pos[6:], robot.FINGER_OPEN, atol=1e-6)
+    np.testing.assert_allclose(seen.hand_pose, [*START, PUSH_HEIGHT, 1, 0, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(seen.joint_pos[6:], FINGER_OPEN, atol=1e-6)
     assert not seen.diverged
 
 
 @pytest.mark.parametrize("end", [(-0.15, 0.0), (-0.3, 0.15), (-0.25, -0.1)])
 def test_a_free_push_ends_where_it_should(engine, end):
     state = engine.reset(engine.init(), empty_scene())
-    state = jax.jit(lambda s: push(engine, s, robot.START_POSE[:2], end))(state)
+    state = jax.jit(lambda s: push(engine, s, START, end))(state)
     hand = engine.observe(state).hand_pose
-    np.testing.assert_allclose(hand[:3], [*end, robot.PUSH_HEIGHT], atol=5e-4)
+    np.testing.assert_allclose(hand[:3], [*end, PUSH_HEIGHT], atol=5e-4)
 
 
 def test_a_free_push_stays_on_its_line(engine):
-    start, end = np.array(robot.START_POSE[:2]), np.array([-0.2, 0.1])
+    start, end = np.array(START), np.array([-0.2, 0.1])
     direction = (end - start) / np.linalg.norm(end - start)
     for num_ctrl in (20, 35, 50):
         state = engine.reset(engine.init(), empty_scene())
         hand = engine.observe(push(engine, state, start, end, jnp.int32(num_ctrl))).hand_pose[:2] - start
         assert abs(float(np.cross(np.append(direction, 0), np.append(hand, 0))[2])) < 2e-3
-        planned = 0.1414 * float(push.minimum_jerk(jnp.float32(num_ctrl * CTRL_DT / 1.414)))
+        planned = 0.1414 * float(minimum_jerk(jnp.float32(num_ctrl * CTRL_DT / 1.414)))
         assert abs(float(np.dot(direction, hand)) - planned) < 4e-3
 
 
@@ -90,7 +92,7 @@ def test_a_push_moves_objects_and_batching_changes_nothing(engine, scenes):
     nearer = jnp.array([-0.08, 0, 0, 0, 0, 0, 0])
     packed = [packed_scene(scenes, i) for i in range(3)]
     packed = [scene.replace(poses=scene.poses + nearer[None]) for scene in packed]
-    plans = [plan(jnp.asarray(robot.home_joint_pos()[:6]), robot.START_POSE[:2], end) for end in ENDS]
+    plans = [plan(jnp.asarray(ROBOT.home), START, end) for end in ENDS]
 
     def run(scene, plan):
         return engine.run(engine.reset(engine.init(), scene), plan.ctrl, plan.num_ctrl)
@@ -105,7 +107,7 @@ def test_a_push_moves_objects_and_batching_changes_nothing(engine, scenes):
 
 def test_zero_rows_change_nothing(engine, scenes):
     state = engine.reset(engine.init(), packed_scene(scenes, 0))
-    after = push(engine, state, robot.START_POSE[:2], (-0.2, 0.0), jnp.int32(0))
+    after = push(engine, state, START, (-0.2, 0.0), jnp.int32(0))
     np.testing.assert_array_equal(state.bits, after.bits)
 
 
@@ -116,12 +118,12 @@ def test_a_diverged_scene_is_reported_alone_and_stays_diverged(engine, scenes, t
     both = jax.tree.map(lambda *x: jnp.stack(x), bad, scene)
 
     def run(scene):
-        return push(engine, engine.reset(engine.init(), scene), robot.START_POSE[:2], (-0.25, 0.0))
+        return push(engine, engine.reset(engine.init(), scene), START, (-0.25, 0.0))
 
     state = jax.jit(jax.vmap(run))(both)
     np.testing.assert_array_equal(state.diverged, [True, False])
     assert not list(tmp_path.iterdir()), "MuJoCo must not leave a log file behind"
-    again = jax.vmap(lambda s: push(engine, s, robot.START_POSE[:2], (-0.25, 0.0)))(state)
+    again = jax.vmap(lambda s: push(engine, s, START, (-0.25, 0.0)))(state)
     np.testing.assert_array_equal(again.diverged, [True, False])
 
 
@@ -129,7 +131,7 @@ def test_how_a_scene_diverges_does_not_depend_on_when_others_are_through(engine,
     """The host runs the rows up to where the first scene is through, then the rest."""
     scene = packed_scene(scenes, 0)
     sick = engine.reset(engine.init(), dataclasses.replace(scene, poses=scene.poses.at[0, 0].set(jnp.nan)))
-    planned = plan(jnp.asarray(robot.home_joint_pos()[:6]), robot.START_POSE[:2], (-0.25, 0.0))
+    planned = plan(jnp.asarray(ROBOT.home), START, (-0.25, 0.0))
     alone = engine.run(sick, planned.ctrl, jnp.int32(20))
     both = jax.tree.map(lambda *x: jnp.stack(x), sick, engine.reset(engine.init(), scene))
     beside = jax.vmap(lambda state, rows: engine.run(state, planned.ctrl, rows))(both, jnp.array([20, 3]))
@@ -152,7 +154,7 @@ def test_too_deep_and_too_fast_end_a_scene_and_nothing_else_does(engine, scenes)
             qvel[-1] = 150.0
         states[index] = engine.place(states[index].object_ids, jnp.asarray(qpos), jnp.asarray(qvel))
     batch = jax.tree.map(lambda *x: jnp.stack(x), *states)
-    planned = plan(jnp.asarray(robot.home_joint_pos()[:6]), robot.START_POSE[:2], (-0.25, 0.0))
+    planned = plan(jnp.asarray(ROBOT.home), START, (-0.25, 0.0))
     run = jax.vmap(lambda state: engine.run(state, planned.ctrl, jnp.int32(2)))
     after = run(batch)
     np.testing.assert_array_equal(after.diverged, list(wanted.values()))
@@ -163,9 +165,7 @@ def test_too_deep_and_too_fast_end_a_scene_and_nothing_else_does(engine, scenes)
 
 def test_coordinates_put_a_scene_into_the_same_place(engine, scenes):
     packed = jax.tree.map(lambda *x: jnp.stack(x), packed_scene(scenes, 0), packed_scene(scenes, 1))
-    states = jax.vmap(lambda scene: push(engine, engine.reset(engine.init(), scene), robot.START_POSE[:2], ENDS[1]))(
-        packed
-    )
+    states = jax.vmap(lambda scene: push(engine, engine.reset(engine.init(), scene), START, ENDS[1]))(packed)
     again = jax.vmap(lambda s: engine.place(s.object_ids, *engine.coordinates(s)))(states)
     for old, new in zip(*(jax.tree.leaves(jax.vmap(engine.observe)(s)) for s in (states, again)), strict=True):
         np.testing.assert_array_equal(old, new)
@@ -176,4 +176,27 @@ def test_coordinates_put_a_scene_into_the_same_place(engine, scenes):
 
 def test_an_unknown_engine_is_refused():
     with pytest.raises(ValueError, match=r"physics.engine = 'bullet' .* allowed: native"):
-        make_engine("bullet", builtin_bank("seen"))
+        make_engine("bullet", builtin_bank("seen"), ROBOT, TABLE)
+
+
+def test_float32_is_widened_to_the_bits_of_float64():
+    rng = np.random.default_rng(0)
+    limits = np.finfo(np.float32)
+    special = [0.0, -0.0, 1.0, -1.0, np.inf, -np.inf, limits.max, limits.min, limits.tiny, -limits.tiny, 1 / 3, np.pi]
+    anything = rng.integers(0, 2**32, 20_000, dtype=np.uint32).view(np.float32)
+    normal = anything[np.isfinite(anything) & (np.abs(anything) >= limits.tiny)]
+    assert len(normal) > 15_000 and len(np.unique(np.frexp(normal)[1])) > 240, "of every exponent"
+    values = np.concatenate([np.array(special, np.float32), normal])
+    for compiled in (False, True):
+        bits = np.asarray((jax.jit(widen_bits) if compiled else widen_bits)(jnp.asarray(values)))
+        np.testing.assert_array_equal(bits, values.astype(np.float64).view(np.uint32).reshape(-1, 2))
+    nan = np.ascontiguousarray(widen_bits(jnp.array([jnp.nan, -jnp.nan]))).view(np.float64)
+    assert np.isnan(nan).all()
+    subnormal = np.array([limits.smallest_subnormal, -limits.tiny / 2], np.float32)
+    found = np.ascontiguousarray(widen_bits(jnp.asarray(subnormal))).view(np.float64)
+    np.testing.assert_array_equal(found.ravel(), [0.0, 0.0])
+
+
+def test_controls_of_another_robot_are_refused(engine):
+    with pytest.raises(ValueError, match="ctrl must have 7 columns for robot ur5e_rg2, got 6"):
+        engine.run(engine.init(), jnp.zeros((3, 6)), jnp.int32(3))

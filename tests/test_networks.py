@@ -5,7 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fake_env import ACTIONS
 
+from pregrasp_jax.heightmap import network_input
 from pregrasp_jax.learning.networks import (
     QNetwork,
     ResidualBlock,
@@ -14,9 +16,10 @@ from pregrasp_jax.learning.networks import (
     num_parameters,
     upsample,
 )
+from pregrasp_jax.learning.q_function import QFunction
 
 TINY = QNetwork(width=1 / 16, initial_bias=0.7)
-APPLY, Q_AT = jax.jit(TINY.apply), jax.jit(functools.partial(TINY.apply, method="q_of_action"))
+APPLY, Q_AT = jax.jit(TINY.apply), jax.jit(functools.partial(TINY.apply, method="q_at"))
 
 
 @functools.cache
@@ -141,7 +144,8 @@ def test_taken_actions_are_flat_indices():
     x = jax.random.normal(jax.random.key(0), (1, 100, 100, 2))
     action = jnp.array([0, 1, 19_999, 2 * (37 * 100 + 81) + 1])
     whole = APPLY(tiny_params(), x).ravel()
-    taken = Q_AT(tiny_params(), jnp.broadcast_to(x, (4, *x.shape[1:])), action)
+    q = QFunction(TINY, ACTIONS, network_input)
+    taken = q.at(tiny_params()["params"], jnp.broadcast_to(x, (4, *x.shape[1:])), action)
     np.testing.assert_allclose(taken, whole[action], atol=1e-5 * float(jnp.abs(whole).max()))
 
 
@@ -209,3 +213,14 @@ def test_bfloat16_computes_and_returns_float32():
 def test_wrong_shapes_are_named(shape):
     with pytest.raises(AssertionError, match=r"divisible by 4|expected \[B, H, W, 2\]"):
         APPLY(tiny_params(), jnp.zeros(shape))
+
+
+def test_a_value_for_each_of_any_number_of_choices():
+    network, x = QNetwork(num_choices=5, width=1 / 16), jax.random.normal(jax.random.key(0), (2, 20, 20, 2))
+    params = network.init(jax.random.key(1), x)
+    whole = jnp.asarray(network.apply(params, x))
+    row, col = jnp.array([3, 19]), jnp.array([0, 7])
+    one = jnp.asarray(network.apply(params, x, row, col, method="q_at"))
+    assert whole.shape == (2, 20, 20, 5) and one.shape == (2, 5)
+    assert float(jnp.ptp(one, axis=1).min()) > 1e-5
+    np.testing.assert_allclose(one, whole[jnp.arange(2), row, col], atol=1e-5)

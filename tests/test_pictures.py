@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pregrasp_jax import drawing, grid
-from pregrasp_jax.cli import commands, film, player
+from pregrasp_jax import drawing
+from pregrasp_jax.cli import commands
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.evaluation.player import EvaluationConfig, Player, make_player
 from pregrasp_jax.config import Config, SceneConfig
+from pregrasp_jax.evaluation import player
 from pregrasp_jax.evaluation.player import EvaluationConfig, Player, make_player
+from pregrasp_jax.report import play as report_play
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.task.env import Env, make_env
-from pregrasp_jax.types import OPEN
 
 TOP, LEFT, MAP, GAP = 26, 8, 300, 8
 """Pixels of a panel: where its first picture begins, the size of a map, the space between pictures."""
@@ -35,7 +35,7 @@ def targets(env: Env) -> np.ndarray:
     """Return where the targets stand [3, 2], which are turned about the middle of the table at a reset."""
     reset = jax.jit(env.reset_to)
     states = [reset(jnp.int32(scene)) for scene in range(3)]
-    return np.array([state.centroids[state.scene.target] for state in states])
+    return np.array([state.target_xy for state in states])
 
 
 @pytest.fixture
@@ -94,12 +94,12 @@ def test_show_draws_the_target_where_it_stands_and_the_push_towards_it(
 
 
 def test_q_values_are_drawn_where_they_belong(straight: Player) -> None:
-    decision = next(film.make_play(straight, 0)(0))
+    decision = next(report_play.make_play(straight, 0)(0))
     row, col = 40, 20  # x = -0.1475 m, y = -0.0475 m: in reach, and below the middle of the map
     q_values = np.zeros((100, 100, 2))
-    q_values[row, col, OPEN] = 1.0
+    q_values[row, col, 1] = 1.0
     learned = dataclasses.replace(straight, q_values=lambda _: q_values)
-    names, tiles = zip(*film.draw_tiles(learned, decision._replace(action=None)), strict=True)
+    names, tiles = zip(*report_play.draw_tiles(learned, decision._replace(action=None)), strict=True)
     assert names == ("scene", "height, 0 to 0.30 m", "segmentation", "Q closed 0.00 to 1.00", "Q open 0.00 to 1.00")
     brightest = np.argwhere((tiles[4] != tiles[3]).any(axis=-1))
     center = _pixel(np.asarray(grid.cell_to_world(jnp.int32(row), jnp.int32(col))))
@@ -126,6 +126,6 @@ def test_scenes_are_drawn_side_by_side(
 
 @pytest.mark.parametrize(("pushes", "drawn"), [(0, 0), (1, 1), (99, 3)])
 def test_a_decision_is_drawn_after_some_pushes_or_at_the_end(monkeypatch: pytest.MonkeyPatch, pushes: int, drawn: int):
-    monkeypatch.setattr(film, "make_play", lambda *_: lambda scene: iter(range(4)))
-    monkeypatch.setattr(film, "draw_panel", lambda _, decision: decision)
-    assert film.draw_decision(typing.cast(Any, None), scene=0, pushes=pushes) == drawn
+    monkeypatch.setattr(report_play, "make_play", lambda *_: lambda scene: iter(range(4)))
+    monkeypatch.setattr(report_play, "draw_panel", lambda _, decision: decision)
+    assert report_play.draw_decision(typing.cast(Any, None), scene=0, pushes=pushes) == drawn

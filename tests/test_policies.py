@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fake_env import UNREACHABLE_ROWS, FakeEnv, fake_env, make_scenes
+from fake_env import ACTIONS, CLOSED, OPEN, UNREACHABLE_ROWS, FakeEnv, fake_env, hand_at, make_scenes
 
 from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.policies import scripts
+from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.task.rules import TARGET_IN_REGION
-from pregrasp_jax.types import CLOSED, OPEN, REASONS, EnvState, GraspResult, Observation
+from pregrasp_jax.types import REASONS, EnvState, GraspResult, Observation
 
 ENV = fake_env()
 
@@ -21,13 +22,17 @@ ENV = fake_env()
 def _state(p1: tuple[float, float], target: tuple[float, float]) -> EnvState:
     state = ENV.reset_to(0)
     # Every other object sits elsewhere: a policy that aims at the wrong slot is caught.
-    centroids = jnp.full((8, 2), -0.2).at[state.scene.target].set(jnp.array(target))
-    return state.replace(p1=jnp.array(p1), centroids=centroids)
+    centroids = jnp.full((8, 3), -0.2).at[state.scene.target, :2].set(jnp.array(target))
+    return _moved(state, p1).replace(centroids=centroids)
+
+
+def _moved(state: EnvState, xy: tuple[float, float]) -> EnvState:
+    return state.replace(obs=state.obs.replace(hand=hand_at(xy)))
 
 
 def _end(action: jax.Array) -> tuple[np.ndarray, int]:
-    row, col, aperture = grid.decode_action(action)
-    return np.asarray(grid.cell_to_world(row, col)), int(aperture)
+    xy, choice = ACTIONS.decode(action)
+    return np.asarray(xy), int(choice)
 
 
 def test_straight_ends_on_a_target_in_reach(key: jax.Array) -> None:
@@ -67,8 +72,8 @@ def test_random_is_uniform_in_the_half_ring(key: jax.Array) -> None:
     state = _state((-0.1, 0.0), (0.1, 0.1))
     keys = jax.random.split(key, 600)
     actions = jax.jit(jax.vmap(scripts.make_random(ENV), (None, 0)))(state, keys)
-    row, col, aperture = (np.asarray(x) for x in grid.decode_action(actions))
-    mask = np.asarray(ENV.action_mask(state.p1))
+    row, col, aperture = (np.asarray(x) for x in ACTIONS.unravel(actions))
+    mask = np.asarray(ENV.action_mask(state.hand))[..., OPEN]
     assert mask[row, col].all()
     assert abs(aperture.mean() - 0.5) < 0.07
     # Uniform over cells, not over radius or angle: a cell's expected position is the mask's centroid.
@@ -80,8 +85,8 @@ def test_random_is_uniform_in_the_half_ring(key: jax.Array) -> None:
 def test_guided_heads_for_the_target(key: jax.Array) -> None:
     state = _state((-0.1, 0.0), (0.0, 0.1))
     actions = jax.jit(jax.vmap(scripts.make_guided(ENV), (None, 0)))(state, jax.random.split(key, 500))
-    row, col, aperture = grid.decode_action(actions)
-    offset = np.asarray(grid.cell_to_world(row, col)) - np.array([-0.1, 0.0])
+    end, aperture = ACTIONS.decode(actions)
+    offset = np.asarray(end) - np.array([-0.1, 0.0])
     angle = np.arctan2(offset[:, 1], offset[:, 0])
     assert angle.mean() == pytest.approx(np.pi / 4, abs=0.1)
     assert float(aperture.mean()) == pytest.approx(0.7, abs=0.07)
@@ -94,9 +99,9 @@ def test_learned_takes_the_best_allowed_pixel(key: jax.Array) -> None:
     q = jnp.full((100, 100, 2), -5.0)
     q = q.at[rows[1], cols[1], 1].set(9.0).at[outside[0], outside[1], 0].set(8.0)
     q = q.at[rows[0], cols[0], 1].set(-1.0).at[rows[0], cols[0], 0].set(-2.0)
-    make = scripts.make_learned(ENV, lambda params, obs, target: params)
+    make = make_learned(ENV, lambda params, obs, target: params)
     chosen = make(q)(state, key)
-    assert chosen == grid.encode_action(rows[0], cols[0], jnp.int32(OPEN))
+    assert chosen == ACTIONS.encode(rows[0], cols[0], jnp.int32(OPEN))
 
 
 def test_learned_sees_its_own_target(key: jax.Array) -> None:
@@ -108,8 +113,8 @@ def test_learned_sees_its_own_target(key: jax.Array) -> None:
         wanted = jnp.zeros((100, 100, 2)).at[cell[0], cell[1], 0].set(1.0)
         return params * wanted * (target == state.scene.target)
 
-    action = scripts.make_learned(ENV, q_values)(jnp.float32(1.0))(state, key)
-    assert action == grid.encode_action(*cell, jnp.int32(CLOSED))
+    action = make_learned(ENV, q_values)(jnp.float32(1.0))(state, key)
+    assert action == ACTIONS.encode(*cell, jnp.int32(CLOSED))
 
 
 def test_policies_of_one_constructor_share_their_compilation(key: jax.Array) -> None:
@@ -120,7 +125,7 @@ def test_policies_of_one_constructor_share_their_compilation(key: jax.Array) -> 
         traces.append(1)
         return params * jnp.ones((*obs.height.shape, 2))
 
-    make = scripts.make_learned(ENV, q_values)
+    make = make_learned(ENV, q_values)
     decide = jax.jit(lambda policy, state, key: policy(state, key))
     for scale in (1.0, 2.0, 3.0):
         decide(make(jnp.float32(scale)), ENV.reset_to(0), key)
@@ -152,11 +157,11 @@ def test_lookahead_succeeds_where_straight_encloses_the_obstacle(key: jax.Array)
 def test_lookahead_never_takes_a_failure_if_a_candidate_survives(key: jax.Array) -> None:
     env = _world([(-0.2, 0.2), (0.24, -0.24), (0.2, 0.2)])
     # Near the lower edge a large share of the half ring is out of reach, and the target attracts there.
-    state = env.reset_to(0).replace(p1=jnp.array([0.05, -0.2025]))
+    state = _moved(env.reset_to(0), (0.05, -0.2025))
     choose = jax.jit(jax.vmap(scripts.make_lookahead(env), (None, 0)))
-    rows, _, _ = grid.decode_action(choose(state, jax.random.split(key, 6)))
+    rows, _, _ = ACTIONS.unravel(choose(state, jax.random.split(key, 6)))
     assert (rows >= UNREACHABLE_ROWS).all()
-    guided, _, _ = grid.decode_action(jax.vmap(scripts.make_guided(env), (None, 0))(state, jax.random.split(key, 50)))
+    guided, _, _ = ACTIONS.unravel(jax.vmap(scripts.make_guided(env), (None, 0))(state, jax.random.split(key, 50)))
     assert (guided < UNREACHABLE_ROWS).any(), "the test must offer failures"
 
 
@@ -169,7 +174,7 @@ def test_lookahead_ranks_success_then_distance_then_failure() -> None:
         ((-0.1525, 0.0025), OPEN),  # encloses the obstacle
     ]
     rows, cols = zip(*(grid.world_to_cell(jnp.array(xy)) for xy, _ in pushes), strict=True)
-    actions = grid.encode_action(jnp.stack(rows), jnp.stack(cols), jnp.array([aperture for _, aperture in pushes]))
+    actions = ACTIONS.encode(jnp.stack(rows), jnp.stack(cols), jnp.array([aperture for _, aperture in pushes]))
     plans = scripts._advance(env, scripts._start(env.reset_to(0), 4), actions)
     assert plans.ended.tolist() == [True, False, False, True]
     success, near, far, failure = plans.values.tolist()
@@ -207,7 +212,7 @@ def test_lookahead_tries_grasps_until_one_holds() -> None:
 def test_lookahead_forgives_a_failing_continuation(key: jax.Array) -> None:
     # Whatever comes first, the straight push that follows it encloses the obstacle in front of the target.
     env = _world([(-0.1025, 0.0025), (0.0, 0.0025), (0.2, 0.2)])
-    state = env.reset_to(0).replace(p1=jnp.array([-0.2525, 0.0025]))
+    state = _moved(env.reset_to(0), (-0.2525, 0.0025))
     _, result = env.step(state, scripts.make_straight(env)(state, key))
     assert REASONS[int(result.reason)] == "obstacle_in_region"
     chosen = jax.jit(scripts.make_lookahead(env))(state, key)
@@ -219,6 +224,6 @@ def test_every_script_runs_unbatched_under_jit(key: jax.Array) -> None:
     state = ENV.reset_to(3)
     for make in scripts.SCRIPTS.values():
         action = jax.jit(make(ENV))(state, key)
-        row, col, _ = grid.decode_action(action)
+        row, col, _ = ACTIONS.unravel(action)
         assert action.dtype == jnp.int32 and action.shape == ()
-        assert ENV.action_mask(state.p1)[row, col]
+        assert ENV.action_mask(state.hand)[row, col].all()

@@ -11,16 +11,21 @@ from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.checkpoint.policy import PRETRAINED
 from pregrasp_jax.config import to_dict
 from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.robot import get_robot
+from pregrasp_jax.task.push import push_actions
 from pregrasp_jax.types import Observation
 
 
 def test_it_is_small_and_fits_its_network():
     assert sum(file.stat().st_size for file in PRETRAINED.iterdir()) <= 3_000_000
     policy = load_policy("pretrained")
-    q = make_q_function(policy.config.network, policy.config.task)
+    robot = get_robot(policy.config.task.robot)
+    q = make_q_function(policy.config.network, policy.config.task, push_actions(robot))
     assert q.fits(policy.params)
     blank = jnp.zeros((100, 100), jnp.uint8)
-    values = jax.jit(q.values)(policy.params, Observation(blank, blank, jnp.array([-0.3, 0.0])), jnp.int32(0))
+    values = jax.jit(q.values)(
+        policy.params, Observation(blank, blank, jax.tree.map(jnp.asarray, robot.start)), jnp.int32(0)
+    )
     assert np.isfinite(values).all() and 0.05 < np.ptp(np.asarray(values)) < 4, "trained, and within 0 to 4 or so"
 
 

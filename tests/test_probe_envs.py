@@ -5,25 +5,29 @@ hand at cell (0, 0) of the real grid, and the half ring is that cell. Each probe
 """
 
 import functools
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from fake_env import ACTIONS, fake_rules, hand_at, make_outcome
 
+from pregrasp_jax.config import LearnerConfig, ReplayConfig, TaskConfig
 from pregrasp_jax.learning import hindsight, learner, replay
 from pregrasp_jax.spaces.grid import GRID_SIZE
-from pregrasp_jax.task.rules import judge
-from pregrasp_jax.types import MAX_OBJECTS, Observation, Outcome
+from pregrasp_jax.types import MAX_OBJECTS, HandPose, Observation
 
 GAMMA = 0.5
 OPTIMIZER = optax.sgd(0.5)
+RULES = fake_rules(TaskConfig())
 
 
 def image(state: int) -> Observation:
     pixel = jnp.full((1, 1), state, jnp.uint8)
-    return Observation(pixel, pixel, jnp.zeros(2))
+    return Observation(pixel, pixel, hand_at((0.0, 0.0)))
 
 
 def network_input(obs: Observation, goal: jax.Array) -> jax.Array:
@@ -38,26 +42,32 @@ def table_network(params: jax.Array, inputs: jax.Array) -> jax.Array:
     return q.at[:, 0, 0].set(params[state, goal])
 
 
-def one_cell(p1: jax.Array) -> jax.Array:
-    del p1
-    return jnp.zeros((GRID_SIZE, GRID_SIZE), bool).at[0, 0].set(True)
+def table_at(params: jax.Array, inputs: jax.Array, action: jax.Array) -> jax.Array:
+    return table_network(params, inputs).reshape(len(action), -1)[jnp.arange(len(action)), action]
+
+
+TABLE: Any = SimpleNamespace(
+    apply=table_network,
+    at=table_at,
+    input_fn=network_input,
+    augment=lambda key, inputs, action: (inputs, action),
+)
+
+
+def one_cell(hand: HandPose) -> jax.Array:
+    del hand
+    return jnp.zeros(ACTIONS.shape, bool).at[0, 0].set(True)
 
 
 def push(state, action, next_state, *, goal=0, enclosed=None, approach=(), truncated=False) -> replay.Steps:
-    """One scene's push, judged by the shipped judge: `enclosed` and `approach` name object slots."""
+    """One scene's push, judged by the shipped rules: `enclosed` and `approach` name object slots."""
     slots = jnp.arange(MAX_OBJECTS)
-    no = jnp.asarray(False)
-    outcome = Outcome(
+    outcome = make_outcome(
         coverage=(slots == (-1 if enclosed is None else enclosed)).astype(jnp.float32),
         distance_before=jnp.full(MAX_OBJECTS, 0.2),
         distance_after=jnp.where(jnp.isin(slots, jnp.array([*approach, -1])), 0.1, 0.3),
-        toppled=jnp.zeros(MAX_OBJECTS, bool),
-        off_table=jnp.zeros(MAX_OBJECTS, bool),
-        unreachable=no,
-        no_action=no,
-        diverged=no,
     )
-    reward, terminated, _ = judge(outcome, jnp.int32(goal))
+    reward, terminated, reason = RULES.judge(outcome, jnp.int32(goal))
     step = replay.Steps(
         root=jnp.int32(0),
         obs=image(state),
@@ -66,6 +76,7 @@ def push(state, action, next_state, *, goal=0, enclosed=None, approach=(), trunc
         outcome=outcome,
         reward=reward,
         terminated=terminated,
+        reason=reason,
         truncated=jnp.asarray(truncated),
         next_obs=image(next_state),
     )
@@ -81,26 +92,26 @@ def remember(pushes, *, relabel: bool = True) -> replay.Replay:
     return memory
 
 
-add, add_hindsight = jax.jit(replay.add), jax.jit(hindsight.add_hindsight)
+add = jax.jit(replay.add)
+add_hindsight = jax.jit(functools.partial(hindsight.add_hindsight, rules=RULES))
 
 
 @functools.partial(jax.jit, static_argnames=("num_updates", "batch_size", "priority_exponent"))
 def train(memory, params, key, *, num_updates, batch_size=16, priority_exponent=0.6, polyak=0.9):
+    config = LearnerConfig(batch_size=batch_size, discount=GAMMA, polyak=polyak, huber_delta=10.0)
+
     def one(carry, k):
         state, memory, metrics = learner.learn(
             carry[0],
             carry[1],
             k,
-            batch_size=batch_size,
-            input_fn=network_input,
+            q=TABLE,
             importance_exponent=0.4,
-            priority_exponent=priority_exponent,
-            apply_fn=table_network,
+            replay_config=ReplayConfig(priority_exponent=priority_exponent),
+            config=config,
             mask_fn=one_cell,
+            successes=RULES.successes,
             optimizer=OPTIMIZER,
-            discount=GAMMA,
-            polyak=polyak,
-            huber_delta=10.0,
         )
         return (state, memory), metrics
 

@@ -1,24 +1,28 @@
 """Every stored byte of these transitions encodes which push it belongs to, so a misaligned field cannot hide."""
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fake_env import ACTIONS, fake_rules, hand_at, make_outcome
 
+from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.learning import hindsight, replay
-from pregrasp_jax.spaces import grid
-from pregrasp_jax.types import MAX_OBJECTS, Observation, Outcome
+from pregrasp_jax.types import MAX_OBJECTS, REASONS, Observation
 
 NUM_ENVS, MAX_PUSHES = 3, 4
+RULES = fake_rules(TaskConfig())
 
 
 def image(ids) -> Observation:
-    """Observations whose two pixels spell a number below 2^16 in each leaf."""
+    """Observations whose two pixels spell a number below 2^16 in each leaf, and so does the place of the hand."""
     ids = np.asarray(ids)
     pixels = jnp.asarray(np.stack([ids % 256, ids // 256], axis=-1)[..., None, :].astype(np.uint8))
-    return Observation(height=pixels, instance_ids=3 * pixels, p1=jnp.zeros((len(pixels), 2)))
+    hands = jax.vmap(hand_at)(jnp.asarray(np.stack([ids, -ids], axis=-1)))
+    return Observation(height=pixels, instance_ids=3 * pixels, hand=hands)
 
 
 def read_image(obs: Observation) -> np.ndarray:
@@ -50,15 +54,15 @@ class World:
         def stack(name, dtype):
             return jnp.asarray(np.array([row[name] for row in rows], dtype))
 
-        zeros = jnp.zeros(NUM_ENVS, bool)
-        outcome = Outcome(
+        outcome = make_outcome(
             coverage=stack("coverage", np.float32),
             distance_before=stack("obs", np.float32)[:, None] + jnp.arange(8.0)[None],
             distance_after=stack("next_obs", np.float32)[:, None] + jnp.arange(8.0)[None],
+            aperture=jnp.ones(NUM_ENVS),
             toppled=jnp.zeros((NUM_ENVS, MAX_OBJECTS), bool),
             off_table=jnp.zeros((NUM_ENVS, MAX_OBJECTS), bool),
-            unreachable=zeros,
-            no_action=zeros,
+            obstruction=jnp.zeros(NUM_ENVS, jnp.int32),
+            no_action=jnp.zeros(NUM_ENVS, bool),
             diverged=stack("diverged", bool),
         )
         return replay.Steps(
@@ -69,6 +73,7 @@ class World:
             outcome=outcome,
             reward=stack("reward", np.float32),
             terminated=stack("terminated", bool),
+            reason=stack("reason", np.int32),
             truncated=stack("truncated", bool),
             next_obs=image([row["next_obs"] for row in rows]),
         )
@@ -86,9 +91,10 @@ class World:
             "obs": obs,
             "next_obs": next_obs,
             "goal": goal,
-            "action": obs % grid.NUM_ACTIONS,
+            "action": obs % math.prod(ACTIONS.shape),
             "reward": float(obs) / 2,
             "terminated": enclosed,
+            "reason": obs % len(REASONS),
             "truncated": truncated,
             "coverage": coverage,
             "diverged": False,
@@ -112,7 +118,7 @@ def decode_input(inputs: jax.Array) -> tuple[np.ndarray, np.ndarray]:
 
 
 add = jax.jit(replay.add, donate_argnums=0)
-add_hindsight = jax.jit(hindsight.add_hindsight, donate_argnums=0)
+add_hindsight = jax.jit(functools.partial(hindsight.add_hindsight, rules=RULES), donate_argnums=0)
 sample = jax.jit(
     functools.partial(replay.sample, batch_size=64, input_fn=goal_input), static_argnames="importance_exponent"
 )
@@ -262,8 +268,10 @@ def test_sampled_batches_are_aligned_after_wrap_around(key):
             if not batch.hindsight[i]:
                 assert (goal[i], float(batch.reward[i])) == (origin["goal"], origin["reward"])
                 assert bool(batch.terminated[i]) == origin["terminated"]
-        row, col, _ = grid.decode_action(batch.action)
-        np.testing.assert_allclose(batch.next_p1, grid.cell_to_world(row, col), atol=1e-7)
+                assert int(batch.reason[i]) == origin["reason"]
+            elif batch.terminated[i]:
+                assert REASONS[int(batch.reason[i])] == "target_in_region"
+        np.testing.assert_array_equal(batch.next_hand.xy, np.stack([next_obs, -next_obs], axis=-1))
 
 
 def test_truncated_rows_bootstrap():
@@ -338,7 +346,7 @@ def test_one_trace():
     @jax.jit
     def counted(memory, steps):
         traces.append(1)
-        return hindsight.add_hindsight(replay.add(memory, steps), ALL_ELIGIBLE)
+        return hindsight.add_hindsight(replay.add(memory, steps), ALL_ELIGIBLE, RULES)
 
     world, memory = World(12), empty()
     for _ in range(5):

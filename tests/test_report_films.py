@@ -15,12 +15,11 @@ from report_files import evaluation_row, make_films, run_main, write_evaluation,
 
 from pregrasp_jax.checkpoint import save_policy
 from pregrasp_jax.cli import demo as demo_module
-from pregrasp_jax.cli import film as film_module
-from pregrasp_jax.cli import player
 from pregrasp_jax.cli import report as report_module
 from pregrasp_jax.cli.main import main
 from pregrasp_jax.cli.report import report, report_session
 from pregrasp_jax.config import PRESETS
+from pregrasp_jax.evaluation import player
 from pregrasp_jax.learning.networks import QNetwork
 
 LONG = [evaluation_row(300, report_module.WORTH_FILMS, 0.75, [0.5, 0.9])]

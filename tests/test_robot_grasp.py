@@ -6,8 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from pregrasp_jax.robot import closing_region, kinematics
-from pregrasp_jax.robot import model as robot
+from pregrasp_jax.robot import description, get_robot, kinematics
+from pregrasp_jax.robot.ur5e_rg2 import FINGER_CLOSED, FINGER_OPEN
+from pregrasp_jax.scene.spec import compile_spec, scene_spec
+from pregrasp_jax.spaces.workspace import TABLE
+
+ROBOT = get_robot("ur5e_rg2")
+PUSH_HEIGHT = 0.1
 
 DT = 0.004
 SHAPES = [(shape, width, height) for shape in ("box", "cylinder") for width, height in ((0.06, 0.15), (0.07, 0.25))]
@@ -27,7 +32,9 @@ def follow(positions, reference):
     solutions = jax.vmap(kinematics.hand_inverse_kinematics)(jnp.concatenate([positions, level], axis=1))
 
     def step(previous, rows):
-        joints = kinematics.nearest_solution(rows, previous)
+        candidates = kinematics.unwrap_near(rows, previous)
+        gap = jnp.max(jnp.abs(candidates - previous[None]), axis=-1)
+        joints = candidates[jnp.nanargmin(gap)]
         return joints, joints
 
     return jax.lax.scan(step, reference, solutions)[1]
@@ -35,10 +42,10 @@ def follow(positions, reference):
 
 def commands(positions, finger):
     """Controls [T, 7] with the feed-forward of the actuators' damping."""
-    joints = np.asarray(follow(jnp.asarray(positions, jnp.float32), robot.home_joint_pos()[:6]), np.float64)
+    joints = np.asarray(follow(jnp.asarray(positions, jnp.float32), ROBOT.home[:6]), np.float64)
     velocity = np.gradient(joints, DT, axis=0)
     velocity[[0, -1]] = 0.0
-    lead = robot.feed_forward(robot.description.robot_model())[:6]
+    lead = description.feed_forward()[:6]
     return np.column_stack([joints + lead * velocity, np.broadcast_to(finger, len(joints))])
 
 
@@ -50,21 +57,21 @@ def run(mj_model, data, ctrl):
 
 def place_hand(mj_model, data, position):
     """Start at rest with the open hand at a position [3]."""
-    robot.set_home(mj_model, data)
-    joints = np.asarray(follow(jnp.asarray(position, jnp.float32)[None], robot.home_joint_pos()[:6]))[0]
-    data.qpos[robot.joint_qpos_ids(mj_model)[:6]] = joints
+    ROBOT.set_home(mj_model, data)
+    joints = np.asarray(follow(jnp.asarray(position, jnp.float32)[None], ROBOT.home[:6]))[0]
+    data.qpos[ROBOT.joint_qpos_ids(mj_model)[:6]] = joints
     mujoco.mj_forward(mj_model, data)
 
 
 @pytest.mark.parametrize("direction", [0.0, 1.2, -1.2])
 def test_a_push_ends_where_it_was_sent(direction):
-    mj_model = robot.load_spec().compile()
+    mj_model = compile_spec(scene_spec(ROBOT, TABLE))
     data = mujoco.MjData(mj_model)
-    start, length = np.array([-0.2, 0.0, robot.PUSH_HEIGHT]), 0.15
+    start, length = np.array([-0.2, 0.0, PUSH_HEIGHT]), 0.15
     place_hand(mj_model, data, start)
     share = minimum_jerk(np.arange(0, length / 0.1 + 0.25, DT) / (length / 0.1))
     positions = start + share[:, None] * length * np.array([np.cos(direction), np.sin(direction), 0])
-    ctrl = commands(positions, robot.FINGER_OPEN)
+    ctrl = commands(positions, FINGER_OPEN)
     half = len(ctrl) // 2
     run(mj_model, data, ctrl[:half])
     # Half way the hand is under way at full speed, so that a lag of the servo would show.
@@ -87,34 +94,34 @@ def add_object(spec, shape, width, height):
 
 def grasp(shape, width, height, yaw):
     """Close on an object at the palm, lift it 0.2 m, hold 5 s; return how far it rose and its planar slip, m."""
-    spec = robot.load_spec()
+    spec = scene_spec(ROBOT, TABLE)
     add_object(spec, shape, width, height)
-    mj_model = spec.compile()
+    mj_model = compile_spec(spec)
     data = mujoco.MjData(mj_model)
-    hand = np.array([0.0, 0.0, robot.PUSH_HEIGHT])
+    hand = np.array([0.0, 0.0, PUSH_HEIGHT])
     place_hand(mj_model, data, hand)
     sides = 4 if shape == "box" else 16
     corners = width / 2 / np.cos(np.pi / sides) * np.cos(2 * np.pi * (np.arange(sides) + 0.5) / sides + yaw)
-    palm = closing_region.closing_region_bounds()[0][0]
+    palm = -description.palm_to_grasp_point()
     centre = hand[0] + palm + 0.001 - corners.min()
     data.joint("object").qpos[:] = [centre, 0, 0, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
     mujoco.mj_forward(mj_model, data)
     lift = 0.2 * minimum_jerk((np.arange(0, 8.0, DT) - 1.0) / 2.0)
-    run(mj_model, data, commands(hand + lift[:, None] * np.array([0, 0, 1.0]), robot.FINGER_CLOSED))
+    run(mj_model, data, commands(hand + lift[:, None] * np.array([0, 0, 1.0]), FINGER_CLOSED))
     moved = data.body("object").xpos - [centre, 0, 0]
     return moved[2], np.linalg.norm(moved[:2])
 
 
 @pytest.mark.parametrize("width", [0.02, 0.07, 0.105])
 def test_the_fingers_press_with_at_most_40_newton(width):
-    spec = robot.load_spec()
-    body = spec.worldbody.add_body(name="object", pos=[-0.28, 0, robot.PUSH_HEIGHT])
+    spec = scene_spec(ROBOT, TABLE)
+    body = spec.worldbody.add_body(name="object", pos=[-0.28, 0, PUSH_HEIGHT])
     body.add_joint(name="slide", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0], damping=1.0)
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.03, width / 2, 0.03], mass=0.5, name="object")
-    mj_model = spec.compile()
+    mj_model = compile_spec(spec)
     data = mujoco.MjData(mj_model)
-    robot.set_home(mj_model, data)
-    data.ctrl[mj_model.actuator("hand_fingers").id] = robot.FINGER_CLOSED
+    ROBOT.set_home(mj_model, data)
+    data.ctrl[mj_model.actuator("hand_fingers").id] = FINGER_CLOSED
     mujoco.mj_step(mj_model, data, 500)
     left = {mj_model.geom(name).id for name in ("hand_left_pad", "hand_left_tip", "hand_left_driver")}
     force, total = np.zeros(6), 0.0

@@ -25,6 +25,7 @@ from fake_training import (
 from pregrasp_jax.checkpoint import checksum, load_policy
 from pregrasp_jax.config import PRESETS, ExplorationConfig, from_dict, to_dict
 from pregrasp_jax.learning import learner
+from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training import collect, learn
 from pregrasp_jax.training.run_folder import RunFolder, stored_config
 from pregrasp_jax.training.trainer import Trainer
@@ -276,14 +277,14 @@ def test_tally_keeps_the_reasons_of_the_last_episodes():
         random, overflowed = jnp.array([True, False, False]), jnp.array([reason[0] == success, False, True])
         diverged = jnp.array([False, False, False, reason[1] == success, True])  # with a branch of two scenes
         tally = collect._count(tally, results, jnp.array(ended, bool), random, overflowed, diverged)
-    report = collect.report(tally)
+    report = collect.metrics(tally, (success,))
     assert report["train/success_rate"] == 0.5, "the first success has left the window of four"
     assert (report["episodes"], report["env_steps"]) == (5, 9)
     assert (report["reasons/target_in_region"], report["reasons/truncated"]) == (3, 2)
     assert report["train/explored"] == pytest.approx(1 / 3) and report["train/episode_length"] == pytest.approx(9 / 5)
     assert report["physics/overflows"] == 4, "one in the first scene, three in the last"
     assert report["physics/diverged"] == 4, "one in one branch, three in the last"
-    fresh = collect.report(tally.begin_report())
+    fresh = collect.metrics(tally.begin_report(), (success,))
     assert fresh["physics/overflows"] == 0 and fresh["physics/diverged"] == 0
     assert fresh["train/success_rate"] == 0.5 and fresh["train/reward"] is None and fresh["episodes"] == 5
 
@@ -294,9 +295,9 @@ class CountingEnv(PictureEnv):
 
     traces: list[int] = dataclasses.field(default_factory=list)
 
-    def step(self, state: EnvState, action: jax.Array, **options: Any) -> tuple[EnvState, StepResult]:
+    def conclude(self, state: EnvState, plan: Plan, physics: Any) -> tuple[EnvState, StepResult]:
         self.traces.append(1)
-        next_state, result = super().step(state, action, **options)
+        next_state, result = super().conclude(state, plan, physics)
         seen = state.physics_obs
         return next_state.replace(physics_obs=seen.replace(overflows=seen.overflows + 5)), result
 
@@ -311,7 +312,7 @@ def test_a_push_is_traced_once_for_shapes_start_and_compilation_and_its_overflow
     actors, _ = compiled.collect(state.actors, params)
     actors, _ = compiled.collect(actors, params)
     assert len(env.traces) == 1
-    assert collect.report(actors.tally)["physics/overflows"] == 2 * config.train.num_envs
+    assert collect.metrics(actors.tally, built.successes)["physics/overflows"] == 2 * config.train.num_envs
 
 
 def test_a_run_of_fused_iterations_measures_what_the_loop_does(tmp_path, finished):

@@ -103,15 +103,14 @@ def eligibility(bank: HullBank, region: ClosingRegion, *, max_width: float) -> E
 
 def _ineligibility(bank: HullBank, index: int, region: ClosingRegion, max_width: float) -> str:
     """Return why an object cannot be a target, one clause; empty if it can."""
-    width, found = (
-        float(bank.min_width[index]),
-        best_coverage(*projection(bank, index), region, enough=MIN_TARGET_COVERAGE),
-    )
+    width = float(bank.min_width[index])
+    found = best_coverage(*projection(bank, index), region, enough=MIN_TARGET_COVERAGE)
     reasons = []
     if width >= max_width:
         reasons.append(f"narrowest width {width * 1e3:.1f} mm, must be < {max_width * 1e3:.0f}")
     if found <= MIN_TARGET_COVERAGE:
-        reasons.append(f"best coverage {found:.3f}, must be > {MIN_TARGET_COVERAGE}")
+        # Rounded down, so that what is just too small does not read as if it were enough.
+        reasons.append(f"best coverage {np.floor(found * 1000) / 1000:.3f}, must be > {MIN_TARGET_COVERAGE}")
     return "; ".join(reasons)
 
 

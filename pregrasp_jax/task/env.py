@@ -189,6 +189,8 @@ def make_env(
     """
     startup.check()
     threads = config.physics.threads if threads is None else threads
+    refuse_walls(get_robot(config.task.robot), get_workspace(config.task.workspace))
+    registry.get_kind(config.task.primitive)  # before anything is packed
     bank = load_bank_for(config.assets.object_dir, config.assets.object_set)
     eligible = eligible_targets(get_robot(config.task.robot), bank)
     scenes = scene_bank.load_or_build(bank, eligible, config.scene, split, threads=threads, progress=progress)

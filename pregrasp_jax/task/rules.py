@@ -69,7 +69,7 @@ class Rules:
 
     def succeeded(self, reason: jax.Array) -> jax.Array:
         """Return [...] bool, which reasons [...] count as success."""
-        return jnp.any(reason[..., None] == jnp.array(self.successes), axis=-1)
+        return jnp.any(jnp.stack([reason == success for success in self.successes]), axis=0)
 
 
 def make_rules(robot: Robot, workspace: Workspace, primitive: Primitive, bank: HullBank, task: TaskConfig) -> Rules:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from fake_training import PictureEnv, make_config, make_trainer, rows
 
-from pregrasp_jax.task.rules import judge
+from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training import dump
 from pregrasp_jax.training.collect import Actors
 from pregrasp_jax.training.dump import load_dump
@@ -30,14 +30,14 @@ NAN = REASONS.index("nan")
 class FrailEnv(PictureEnv):
     """Reports what an engine reports: whether anything of a scene is not finite."""
 
-    def step(self, state: EnvState, action: jax.Array, **options: Any) -> tuple[EnvState, StepResult]:
-        next_state, result = super().step(state, action, **options)
+    def conclude(self, state: EnvState, plan: Plan, physics: Any) -> tuple[EnvState, StepResult]:
+        next_state, result = super().conclude(state, plan, physics)
         diverged = ~jnp.all(jnp.isfinite(state.centroids))
         outcome = result.outcome.replace(diverged=diverged)
-        reward, terminated, reason = judge(outcome, state.scene.target)
+        reward, terminated, reason = self.rules.judge(outcome, state.scene.target)
         reason = jnp.where(diverged, reason, result.reason)
         truncated = result.truncated & ~diverged
-        return next_state, StepResult(outcome, reward, terminated, truncated, reason)
+        return next_state, StepResult(outcome, reward, terminated, truncated, reason, result.seconds)
 
 
 def poison(actors: Actors) -> Actors:
