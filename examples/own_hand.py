@@ -48,8 +48,8 @@ DEPTH, WIDTH = 0.10, 0.106
 
 HEADINGS = 8
 
-EDGE = 0.2475
-"""m, outermost cells: where the script moves around the clutter."""
+EDGE, CLEARANCE = 0.2475, 0.10
+"""m, the outermost cells, where ways to the target begin; distance to the middle of an obstacle that is enough."""
 
 
 def region(aperture: jax.Array) -> ClosingRegion:
@@ -88,14 +88,15 @@ KINDS["paddle"] = Kind(make_paddle_pushes, make_rules)  # judged by the paper's 
 
 
 def make_steer(env: Env) -> Policy:
-    """Return the script: go around to where the way to the target is free, and in from there."""
+    """Return the script: go to where a straight way to the target is free of obstacles, and in from there."""
     actions = env.primitive.actions
     yaws = jnp.array([choice.yaw for choice in actions.choices])
     ahead = jnp.stack([jnp.cos(yaws), jnp.sin(yaws)], axis=1)
-    corners = EDGE * jnp.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 
-    def heading_to(direction: jax.Array) -> jax.Array:
-        return jnp.argmax(ahead @ direction)
+    def entry(point: jax.Array, forward: jax.Array) -> jax.Array:
+        """Return where a line [2] with this direction to a point of the table enters the table."""
+        lengths = (EDGE + jnp.sign(forward) * point) / jnp.maximum(jnp.abs(forward), 1e-3)
+        return point - jnp.min(lengths) * forward
 
     def act(state: EnvState, key: jax.Array) -> jax.Array:
         del key
@@ -103,36 +104,22 @@ def make_steer(env: Env) -> Policy:
         others = (state.scene.object_ids >= 0) & (jnp.arange(len(state.centroids)) != state.scene.target)
         obstacles = jnp.where(others[:, None], state.centroids[:, :2], 9.0)
 
-        def gate(forward: jax.Array) -> jax.Array:
-            """Where the line to the target with this heading enters the workspace."""
-            to_edge = (EDGE + jnp.sign(forward) * target) / jnp.maximum(jnp.abs(forward), 1e-3)
-            return target - forward * jnp.min(to_edge)
+        def cost(start: jax.Array) -> jax.Array:
+            """Return how much is in the way from here to the target, and how far it is to get here, m."""
+            way_in = jnp.sum(jnp.maximum(CLEARANCE - _distance(obstacles, start, target), 0.0))
+            way_there = jnp.maximum(CLEARANCE - jnp.min(_distance(obstacles, hand, start)), 0.0)
+            return way_in + 0.5 * way_there + 0.02 * jnp.linalg.norm(start - hand)
 
-        gates = jax.vmap(gate)(ahead)
-        blocked = jax.vmap(lambda start: jnp.sum(jnp.maximum(0.10 - _distance(obstacles, start, target), 0.0)))(gates)
-        choice = jnp.argmin(blocked + 0.02 * jnp.linalg.norm(gates - hand[None], axis=-1))
-        forward = ahead[choice]
-
-        offset = target - hand
-        sideways = jnp.abs(forward[0] * offset[1] - forward[1] * offset[0])
-        aligned = (jnp.cos(state.hand.yaw - yaws[choice]) > 0.99) & (sideways < 0.02) & (offset @ forward > -0.03)
+        entries = jax.vmap(entry, (None, 0))(target, ahead)
+        best = jnp.argmin(jax.vmap(cost)(entries))
+        here = jnp.argmax(jnp.cos(yaws - state.hand.yaw))
+        to_target = target - hand
+        sideways = jnp.abs(ahead[best] @ jnp.stack([-to_target[1], to_target[0]]))
+        aligned = (here == best) & (sideways < 0.02) & (to_target @ ahead[best] > -0.03)
         inside = jnp.max(jnp.abs(hand)) < EDGE - 0.01
-        backward = -jnp.stack([jnp.cos(state.hand.yaw), jnp.sin(state.hand.yaw)])
-        to_edge = (EDGE - jnp.sign(backward) * hand) / jnp.maximum(jnp.abs(backward), 1e-3)
-        retreat = hand + backward * jnp.min(to_edge)
-        free = jnp.min(_distance(obstacles, hand, gates[choice])) > 0.10
-
-        around = jnp.arctan2(gates[choice][1], gates[choice][0]) - jnp.arctan2(hand[1], hand[0])
-        side = jnp.where(jnp.sin(around) >= 0, 1.0, -1.0)
-        angles = jnp.arctan2(corners[:, 1], corners[:, 0]) - jnp.arctan2(hand[1], hand[0])
-        corner = corners[jnp.argmin(jnp.mod(side * angles - 0.3, 2 * jnp.pi))]
-
-        goal = jnp.where(free, gates[choice], corner)
-        choice = jnp.where(free, choice, heading_to(-corner))
-        goal = jnp.where(inside, retreat, goal)
-        choice = jnp.where(inside, heading_to(-backward), choice)
-        goal = jnp.where(aligned, target + 0.005 * forward, goal)
-        choice = jnp.where(aligned, heading_to(forward), choice)
+        retreat = entry(hand, ahead[here])
+        goal = jnp.where(aligned, target, jnp.where(inside, retreat, entries[best]))
+        choice = jnp.where(inside & ~aligned, here, best)
         return nearest_action(env.action_mask(state.hand), goal, choice, actions)
 
     return act
