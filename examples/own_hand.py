@@ -5,6 +5,9 @@ Prints how often the script brings the target between the paddle's lips, with a 
 python examples/own_hand.py
 """
 
+import pregrasp_jax  # noqa: F401  (before jax, which reads then how many threads it may have)
+
+# isort: split
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -6,6 +6,9 @@ the first scene:
 python examples/own_place.py
 """
 
+import pregrasp_jax  # noqa: F401  (before jax, which reads then how many threads it may have)
+
+# isort: split
 import dataclasses
 import math
 from pathlib import Path

@@ -5,6 +5,9 @@ Prints the table row of `evaluate.py` for it:
 python examples/own_policy.py --episodes 100
 """
 
+import pregrasp_jax  # noqa: F401  (before jax, which reads then how many threads it may have)
+
+# isort: split
 import jax
 import jax.numpy as jnp
 import tyro

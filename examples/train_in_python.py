@@ -5,6 +5,9 @@ Prints what every part did; a real training is `train.py`, which also logs, keep
 python examples/train_in_python.py
 """
 
+import pregrasp_jax  # noqa: F401  (before jax, which reads then how many threads it may have)
+
+# isort: split
 import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
