@@ -15,9 +15,7 @@ from collections.abc import Sequence
 from typing import Any
 
 if importlib.util.find_spec("gymnasium") is None:
-    raise ImportError(
-        'pregrasp_jax.gymnasium needs gymnasium; install it with `pip install "pregrasp_jax[gymnasium]"`'
-    )
+    raise ImportError('pregrasp_jax.gymnasium needs gymnasium; install it with `pip install "pregrasp_jax[gymnasium]"`')
 
 import gymnasium
 import jax
@@ -76,7 +74,9 @@ class PreGraspVectorEnv(VectorEnv):
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}  # noqa: RUF012  (Gymnasium's)
 
-    def __init__(self, num_envs: int = 1, *, config: Config | None = None, split: Split = "train", env: Env | None = None):
+    def __init__(
+        self, num_envs: int = 1, *, config: Config | None = None, split: Split = "train", env: Env | None = None
+    ):
         """Load or pack the scenes, and compile.
 
         Args:

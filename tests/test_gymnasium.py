@@ -1,8 +1,8 @@
 """Gymnasium's view of the task: its checker passes, and results are those of the JAX interface."""
 
-import builtins
 import importlib.util
 import warnings
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,11 @@ def test_same_seeds_and_actions_give_what_the_jax_interface_gives(env, envs):
     step, show = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(interface.observe))
     mask_of = jax.jit(jax.vmap(env.action_mask))
     keys = jnp.stack([jax.random.key(SEED + i) for i in range(SCENES)])
-    state, ended, episode = reset(keys, jnp.zeros(SCENES, jnp.int32)), np.zeros(SCENES, bool), np.zeros(SCENES, np.int32)
+    state, ended, episode = (
+        reset(keys, jnp.zeros(SCENES, jnp.int32)),
+        np.zeros(SCENES, bool),
+        np.zeros(SCENES, np.int32),
+    )
     ends = 0
     for push in range(PUSHES):
         jax.tree.map(np.testing.assert_array_equal, obs, jax.device_get(show(state)))
@@ -85,6 +89,8 @@ def test_spaces_hold_what_comes_out(envs):
     assert envs.single_action_space.n == 20_000
     mask = infos["action_mask"][0]
     assert mask[envs.single_action_space.sample(mask=mask)] == 1
+    drawn = envs.action_space.sample(mask=tuple(infos["action_mask"]))
+    assert all(infos["action_mask"][np.arange(SCENES), drawn] == 1)
 
 
 def test_refusals_say_what_is_allowed(envs):
@@ -113,6 +119,6 @@ def test_the_checker_of_gymnasium_passes(env):
 def test_one_line_says_what_to_install(monkeypatch):
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "gymnasium" else found(name, *a))
-    source = builtins.open(interface.__file__).read()
+    source = Path(interface.__file__).read_text()
     with pytest.raises(ImportError, match=r'pip install "pregrasp_jax\[gymnasium\]"'):
         exec(compile(source, interface.__file__, "exec"), {"__name__": "again"})
