@@ -42,7 +42,7 @@ def make_place(config: Config, name: str) -> Env:
 
 
 def draw(env: Env, path: Path) -> None:
-    """Write a view of the first scene beside its heightmap."""
+    """Write a view of the first scene."""
     state = jax.jit(env.reset_to)(jnp.int32(0))
     view = drawing.draw_camera(env_hulls(env, state), target_slot=int(state.scene.target))
     drawing.save_png(path, view)
@@ -51,14 +51,13 @@ def draw(env: Env, path: Path) -> None:
 def main(*, scenes: int = 50, num_envs: int = 16, picture: Path | None = None) -> dict[str, EvaluationResult]:
     """Evaluate `clear` in both places."""
     config = Config(scene=SceneConfig(test_scenes=scenes)).validate()
-    results = {}
-    for name in ("table", NARROW.name):
-        env = make_place(config, name)
+    envs, results = {name: make_place(config, name) for name in ("table", NARROW.name)}, {}
+    for name, env in envs.items():
         results[name] = evaluate_policy(env, make_clear(env), episodes=scenes, num_envs=num_envs)
         failures = results[name].failures or "none"
         print(f"{name}: {results[name].success_rate:.0%} of {scenes} scenes, failures {failures}")
     if picture:
-        draw(env, picture)
+        draw(envs[NARROW.name], picture)
     return results
 
 

@@ -93,7 +93,8 @@ class PreGraspVectorEnv(VectorEnv):
         self.num_envs = num_envs
         self.jax_env = env or make_env((config or Config()).validate(), split=split)
         self.single_observation_space = observation_space()
-        self.single_action_space = spaces.Discrete(int(np.prod(self.jax_env.primitive.actions.shape)))
+        self._num_actions = int(np.prod(self.jax_env.primitive.actions.shape))
+        self.single_action_space = spaces.Discrete(self._num_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._keys = jax.random.split(jax.random.key(0), num_envs)
@@ -120,7 +121,7 @@ class PreGraspVectorEnv(VectorEnv):
         if seed is None and self._state is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0] >> 1)
         if seed is not None:
-            seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else list(seed)
+            seeds: list[Any] = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else list(seed)
             if len(seeds) != self.num_envs or not all(isinstance(number, int) for number in seeds):
                 raise ValueError(f"seed = {seed}; allowed is an int, or a list of {self.num_envs}")
             self._keys = jnp.stack([jax.random.key(number) for number in seeds])
@@ -138,7 +139,7 @@ class PreGraspVectorEnv(VectorEnv):
             raise gymnasium.error.ResetNeeded("call reset before step")
         actions = np.asarray(actions)
         if actions.shape != (self.num_envs,) or not self.action_space.contains(actions.astype(np.int64)):
-            raise ValueError(f"actions {actions}; allowed are {self.num_envs} of 0 to {self.single_action_space.n - 1}")
+            raise ValueError(f"actions {actions}; allowed are {self.num_envs} of 0 to {self._num_actions - 1}")
         self._episodes = self._episodes + self._ended
         self._state, shown, result = self._push(
             self._state, actions.astype(np.int32), self._ended, self._keys, self._episodes

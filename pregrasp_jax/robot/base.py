@@ -3,7 +3,7 @@
 `robot.ur5e_rg2` is the first; docs/extend.md says how to add your own.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -91,7 +91,7 @@ def hand_pose_of(xy: tuple[float, float], *, z: float, yaw: float, aperture: flo
     return HandPose(np.array([x, y], np.float32), *map(np.float32, (z, yaw, aperture)))  # pyright: ignore[reportArgumentType]
 
 
-def first_obstruction(holds: Mapping[str, jax.Array]) -> jax.Array:
+def first_obstruction(holds: dict[str, jax.Array]) -> jax.Array:
     """Return an index into `OBSTRUCTIONS` [T] int32: the first name that holds [T] bool, 0 where none does."""
     code = jnp.zeros(next(iter(holds.values())).shape, jnp.int32)
     for name in reversed(holds):
