@@ -35,6 +35,8 @@ from pregrasp_jax.types import MAX_OBJECTS, ROBOT_ID, EnvState, StepResult
 
 ENV_ID = "pregrasp_jax/PreGrasp-v0"
 
+_INTEGER = (int, np.integer)
+
 
 def observation_space() -> spaces.Dict:
     """Return what one scene shows.
@@ -121,10 +123,10 @@ class PreGraspVectorEnv(VectorEnv):
         if seed is None and self._state is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0] >> 1)
         if seed is not None:
-            seeds: list[Any] = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else list(seed)
-            if len(seeds) != self.num_envs or not all(isinstance(number, int) for number in seeds):
+            seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, _INTEGER) else list(seed)
+            if len(seeds) != self.num_envs or not all(isinstance(number, _INTEGER) for number in seeds):
                 raise ValueError(f"seed = {seed}; allowed is an int, or a list of {self.num_envs}")
-            self._keys = jnp.stack([jax.random.key(number) for number in seeds])
+            self._keys = jnp.stack([jax.random.key(int(number)) for number in seeds])
             self._episodes = np.zeros(self.num_envs, np.int32)
         else:
             self._episodes = self._episodes + 1
@@ -136,9 +138,10 @@ class PreGraspVectorEnv(VectorEnv):
     def step(self, actions: Any) -> Any:
         """Push in every scene; scenes that have ended start anew instead."""
         if self._state is None:
-            raise gymnasium.error.ResetNeeded("call reset before step")
+            raise gymnasium.error.ResetNeeded("no episode is running; call reset before step")
         actions = np.asarray(actions)
-        if actions.shape != (self.num_envs,) or not self.action_space.contains(actions.astype(np.int64)):
+        whole = np.issubdtype(actions.dtype, np.integer) and actions.shape == (self.num_envs,)
+        if not whole or actions.min() < 0 or actions.max() >= self._num_actions:
             raise ValueError(f"actions {actions}; allowed are {self.num_envs} of 0 to {self._num_actions - 1}")
         self._episodes = self._episodes + self._ended
         self._state, shown, result = self._push(
@@ -182,6 +185,7 @@ class PreGraspEnv(gymnasium.Env):
     def __init__(self, *, config: Config | None = None, split: Split = "train", env: Env | None = None):
         """Load or pack the scenes, and compile; see `PreGraspVectorEnv`."""
         self._envs = PreGraspVectorEnv(1, config=config, split=split, env=env)
+        self._running = False
         self.observation_space = self._envs.single_observation_space
         self.action_space = self._envs.single_action_space
 
@@ -193,12 +197,16 @@ class PreGraspEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Start an episode; without a seed the next one of the last seed."""
         super().reset(seed=seed)
+        self._running = True
         obs, infos = self._envs.reset(seed=seed, options=options)
         return _first(obs), _info(infos)
 
     def step(self, action: Any) -> Any:
-        """Push."""
+        """Push; an episode that has ended must be reset first."""
+        if not self._running:
+            raise gymnasium.error.ResetNeeded("no episode is running; call reset before step")
         obs, reward, terminated, truncated, infos = self._envs.step(np.asarray(action)[None])
+        self._running = not (terminated[0] or truncated[0])
         return _first(obs), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _info(infos)
 
 

@@ -97,6 +97,8 @@ def test_refusals_say_what_is_allowed(envs):
     envs.reset(seed=0)
     with pytest.raises(ValueError, match="allowed are 2 of 0 to 19999"):
         envs.step(np.array([0, 20_000]))
+    with pytest.raises(ValueError, match="allowed are 2 of 0 to 19999"):
+        envs.step(np.array([0.5, 1.5]))
     with pytest.raises(ValueError, match="an int, or a list of 2"):
         envs.reset(seed=[1])
     with pytest.raises(ValueError, match="allowed are none"):
@@ -112,8 +114,13 @@ def test_the_checker_of_gymnasium_passes(env):
         warnings.filterwarnings("ignore", message=".*Box.*(infinity|precision).*")
         check_env(single.unwrapped, skip_render_check=True)
     _, info = single.reset(seed=0)
-    _, _, _, _, info = single.step(int(np.flatnonzero(info["action_mask"])[0]))
-    assert REASONS[info["reason"]] in REASONS
+    ended = False
+    while not ended:
+        _, _, terminated, truncated, info = single.step(int(np.flatnonzero(info["action_mask"])[0]))
+        ended = terminated or truncated
+    assert info["reason"] != REASONS.index("running")
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset before step"):
+        single.unwrapped.step(0)
 
 
 def test_one_line_says_what_to_install(monkeypatch):
