@@ -9,11 +9,25 @@ import numpy as np
 import pytest
 
 from pregrasp_jax.checkpoint import load_policy
+from pregrasp_jax.robot import ROBOTS, get_robot
 from pregrasp_jax.spaces import grid
+from pregrasp_jax.spaces.workspace import WORKSPACES
+from pregrasp_jax.task.registry import KINDS
 from pregrasp_jax.types import TABLE_ID
 
 ROOT = Path(__file__).parent.parent
 CODE = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "extend.md").read_text(), re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(autouse=True)
+def registries():
+    """Leave the registries as they were: what examples add must not reach other tests."""
+    kept = [(registry, dict(registry)) for registry in (ROBOTS, WORKSPACES, KINDS)]
+    yield
+    for registry, items in kept:
+        registry.clear()
+        registry.update(items)
+    get_robot.cache_clear()
 
 
 def load(name: str):
