@@ -16,7 +16,7 @@ from pregrasp_jax.config import PRESETS, Config, from_dict, to_dict
 from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.task.primitive import Plan
-from pregrasp_jax.training import program
+from pregrasp_jax.training import program, session
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.dump import make_dump
 from pregrasp_jax.training.run_folder import RunFolder
@@ -98,7 +98,6 @@ def make_trainer(
     config: Config,
     *,
     resume: bool = False,
-    begin: bool = True,
     said: TextIO | None = None,
     env: Any = None,
     folder: RunFolder | None = None,
@@ -106,15 +105,13 @@ def make_trainer(
     env = env or PictureEnv()
     built = make_program(config, env)
     folder = folder or (RunFolder.open(path, config) if resume else RunFolder.create(path, config))
-    trainer = Trainer(config, folder, built, evaluate, make_dump(env, config), Console(said or io.StringIO()))
-    if begin:
-        (trainer.resume if folder.has_checkpoint else trainer.begin)()
-    return trainer
+    dump, console = make_dump(env, config), Console(said or io.StringIO())
+    return session.make_trainer(config, folder, built, evaluate, dump, console, resumed=folder.has_checkpoint)
 
 
 def run(path: Path, config: Config, *, stop: Callable[[], bool] = never, **options: Any) -> Trainer:
     trainer = make_trainer(path, config, **options)
-    with trainer.folder:
+    with trainer.recorder.folder:
         trainer.run(stop)
     return trainer
 

@@ -105,11 +105,11 @@ def dumps(env, tmp_path_factory) -> dict[str, Path]:
         actors = trainer.state.actors
         states = broken(env, actors.env_states, what)
         trainer.state = trainer.state.replace(actors=actors.replace(env_states=states))
-        with trainer.folder:
-            trainer._step(program)
-            trainer.log()
+        with trainer.recorder.folder:
+            trainer.step(program)
+            trainer.state = trainer.recorder.log(trainer.state)
         assert int(trainer.state.actors.mishap.action) == NONE
-        (paths[what],) = trainer.folder.dumps.iterdir()
+        (paths[what],) = trainer.recorder.folder.dumps.iterdir()
     return paths
 
 

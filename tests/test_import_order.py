@@ -21,7 +21,7 @@ ORDER = [
     ["learning"],
     ["policies"],
     ["checkpoint"],
-    ["evaluation"],
+    ["evaluation", "gymnasium"],
     ["training"],
     ["report"],
     ["cli"],

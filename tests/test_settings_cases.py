@@ -154,7 +154,7 @@ def begun(tmp_path) -> tuple[Path, Config]:
     """Return a run that has begun and has a checkpoint, with its configuration."""
     path, config = tmp_path / "run", make_config()
     trainer = make_trainer(path, config, begin=False)
-    with trainer.folder as folder:
+    with trainer.recorder.folder as folder:
         folder.begin_session(config, {})
         trainer.begin()
         trainer.run(fake_training.stop_after(2))

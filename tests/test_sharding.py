@@ -81,8 +81,8 @@ def test_four_devices_split_scenes_and_batches_and_learn_what_one_learns(tmp_pat
     }
     _assert_equal_runs(tmp_path / "four" / "run", expected)
     goes_on = make_trainer(tmp_path / "four" / "run", make_config(EPISODES[-1], 0), resume=True)
-    with goes_on.folder:
-        assert goes_on.progress.share_done(goes_on.config) == 1.0, "one device reads what four have written"
+    with goes_on.recorder.folder:
+        assert goes_on.recorder.counters.share_done(goes_on.config) == 1.0, "one device reads what four have written"
 
 
 @pytest.mark.slow
@@ -205,10 +205,10 @@ def test_a_watched_folder_is_only_read(tmp_path):
         trainer = make_trainer(
             tmp_path / "run", config, begin=False, env=PictureEnv(), folder=WatchedFolder(folder.path)
         )
-        with trainer.folder:
-            trainer.folder.begin_session(config, {"hull bank": "another"})
+        with trainer.recorder.folder:
+            trainer.recorder.folder.begin_session(config, {"hull bank": "another"})
             trainer.begin()
             trainer.run(never)
-            trainer.folder.forget_metrics_after(0, evaluated_at=None)
-        assert trainer.saved and trainer.progress.best == 0.25
+            trainer.recorder.folder.forget_metrics_after(0, evaluated_at=None)
+        assert trainer.recorder.saved and trainer.recorder.counters.best == 0.25
         assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before

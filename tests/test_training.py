@@ -38,7 +38,7 @@ def finished(tmp_path_factory) -> Trainer:
 
 
 def test_metrics_add_up(finished):
-    log = [row for row in rows(finished.folder.path) if "train/loss" in row]
+    log = [row for row in rows(finished.recorder.folder.path) if "train/loss" in row]
     assert [row["env_steps"] for row in log] == list(range(6, log[-1]["env_steps"] + 1, 6))
     ended = sum(row[f"reasons/{name}"] for row in log for name in REASONS if name != "running")
     assert ended == log[-1]["episodes"] > 10
@@ -91,8 +91,8 @@ def test_branches_are_learned_from_and_change_nothing_else():
 
 
 def test_a_finished_run_leaves_everything(finished):
-    path = finished.folder.path
-    assert finished.saved and finished.progress.episodes >= 24
+    path = finished.recorder.folder.path
+    assert finished.recorder.saved and finished.recorder.counters.episodes >= 24
     assert stored_config(path) == finished.config
     assert load_policy(path).evaluation["success_rate"] == 0.25
     assert checksum(load_policy(path).params) == checksum(finished.state.learning.learner.target_params)
@@ -102,10 +102,10 @@ def test_a_finished_run_leaves_everything(finished):
 
 def test_same_seed_same_metrics(tmp_path, finished):
     run(tmp_path / "again", finished.config)
-    assert timeless(tmp_path / "again") == timeless(finished.folder.path)
+    assert timeless(tmp_path / "again") == timeless(finished.recorder.folder.path)
     other = dataclasses.replace(finished.config, seed=1)
     run(tmp_path / "other", other)
-    assert timeless(tmp_path / "other") != timeless(finished.folder.path)
+    assert timeless(tmp_path / "other") != timeless(finished.recorder.folder.path)
 
 
 def test_interrupted_and_resumed_equals_uninterrupted(tmp_path, finished):
@@ -114,22 +114,22 @@ def test_interrupted_and_resumed_equals_uninterrupted(tmp_path, finished):
     assert first.progress.env_steps == 7 * 3 and first.saved
     second = run(path, finished.config, resume=True)
     assert checksum(second.state) == checksum(finished.state)
-    assert timeless(path) == timeless(finished.folder.path)
+    assert timeless(path) == timeless(finished.recorder.folder.path)
 
 
 def test_resume_repeats_what_a_crash_lost(tmp_path, finished):
     """A crash after the checkpoint: its metrics rows are measured again, and a cut last line goes."""
     path = tmp_path / "crashed"
     trainer = make_trainer(path, finished.config)
-    with trainer.folder:
+    with trainer.recorder.folder:
         trainer.run(stop_after(4))
-        trainer._saved_at = trainer.progress.env_steps + 3  # what follows is not saved
+        trainer.recorder._saved_at = trainer.recorder.counters.env_steps + 3  # what follows is not saved
         trainer.run(stop_after(1))
     with (path / "metrics.jsonl").open("a") as file:
         file.write('{"env_steps": 15, "cut')
     second = run(path, finished.config, resume=True)
     assert checksum(second.state) == checksum(finished.state)
-    assert timeless(path) == timeless(finished.folder.path)
+    assert timeless(path) == timeless(finished.recorder.folder.path)
 
 
 def test_every_session_leaves_an_event_file_if_asked(tmp_path):
@@ -160,16 +160,16 @@ def test_a_run_can_be_extended_but_not_changed(tmp_path):
 
 
 def test_a_complete_run_says_so(tmp_path, finished):
-    trainer = make_trainer(finished.folder.path, finished.config, resume=True)
-    with trainer.folder:
+    trainer = make_trainer(finished.recorder.folder.path, finished.config, resume=True)
+    with trainer.recorder.folder:
         assert "is complete" in trainer.run(never)
 
 
 def test_a_run_that_died_in_its_last_evaluation_has_it_when_it_is_resumed(tmp_path):
     path, config = tmp_path / "run", make_config(episodes=6, checkpoint_minutes=0.0)
     trainer = make_trainer(path, config)
-    trainer.evaluate_fn = lambda params: pytest.fail("killed")
-    with trainer.folder, pytest.raises(pytest.fail.Exception):
+    trainer.recorder.evaluate_fn = lambda params: pytest.fail("killed")
+    with trainer.recorder.folder, pytest.raises(pytest.fail.Exception):
         trainer.run(never)
     assert not (path / "best").exists()
     run(path, config, resume=True)
@@ -181,15 +181,15 @@ def test_compiling_the_evaluation_is_announced_measured_and_no_training_time(tmp
     trainer = make_trainer(tmp_path / "run", make_config(episodes=6), said=said)
 
     def compile_evaluation(params: Any) -> None:
-        assert trainer.progress.env_steps == 0 and said.getvalue() == "compiling ...\n"
+        assert trainer.recorder.counters.env_steps == 0 and said.getvalue() == "compiling ...\n"
         assert checksum(params) == checksum(trainer.state.learning.learner.target_params)
         time.sleep(2.0)
 
     trainer.compile_evaluation = compile_evaluation
     start = time.perf_counter()
-    with trainer.folder:
+    with trainer.recorder.folder:
         trainer.run(never)
-    assert trainer.progress.total_seconds < time.perf_counter() - start - 2.0
+    assert trainer.recorder.counters.total_seconds < time.perf_counter() - start - 2.0
     assert all(row["time/compile"] > 2.0 for row in rows(tmp_path / "run") if "train/loss" in row)
 
 
@@ -216,7 +216,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
     poisoned = jax.tree.map(lambda leaf: leaf * jnp.nan, params)
     state = trainer.state.learning.learner.replace(params=poisoned)
     trainer.state = trainer.state.replace(learning=trainer.state.learning.replace(learner=state))
-    with trainer.folder, pytest.raises(FloatingPointError, match="the last checkpoint is of step 0"):
+    with trainer.recorder.folder, pytest.raises(FloatingPointError, match="the last checkpoint is of step 0"):
         trainer.run(never)
 
 

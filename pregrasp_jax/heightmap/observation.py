@@ -64,10 +64,11 @@ def robot_hulls(robot: Robot, joint_pos: jax.Array) -> HullInstances:
 
 def wall_hulls(workspace: Workspace) -> HullInstances:
     """Return the walls of a place, at least one."""
-    hulls = make_hulls([wall.corners() for wall in workspace.walls], FULL_TOPOLOGY)
+    with jax.ensure_compile_time_eval():  # also where a caller is being traced
+        hulls = make_hulls([wall.corners() for wall in workspace.walls], FULL_TOPOLOGY)
     count = len(workspace.walls)
     labels, present = jnp.full(count, TABLE_ID, jnp.uint8), jnp.ones(count, bool)
-    planes, vertices = (jnp.asarray(np.asarray(rows), jnp.float32) for rows in (hulls.planes, hulls.vertices))
+    planes, vertices = (jnp.asarray(rows, jnp.float32) for rows in (hulls.planes, hulls.vertices))
     return HullInstances(planes=planes, vertices=vertices, labels=labels, present=present)
 
 

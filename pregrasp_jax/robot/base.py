@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from pregrasp_jax.robot.links import Links
 from pregrasp_jax.spaces.workspace import Workspace
-from pregrasp_jax.types import HandPose, HullBank
+from pregrasp_jax.types import OBSTRUCTIONS, HandPose, HullBank
 
 
 class ClosingRegion(NamedTuple):
@@ -88,3 +89,11 @@ def hand_pose_of(xy: tuple[float, float], *, z: float, yaw: float, aperture: flo
     """Return a pose in host arrays, float32."""
     x, y = xy
     return HandPose(np.array([x, y], np.float32), *map(np.float32, (z, yaw, aperture)))  # pyright: ignore[reportArgumentType]
+
+
+def first_obstruction(holds: dict[str, jax.Array]) -> jax.Array:
+    """Return an index into `OBSTRUCTIONS` [T] int32: the first name that holds [T] bool, 0 where none does."""
+    code = jnp.zeros(next(iter(holds.values())).shape, jnp.int32)
+    for name in reversed(holds):
+        code = jnp.where(holds[name], OBSTRUCTIONS.index(name), code)
+    return code

@@ -60,7 +60,7 @@ def distance_to_walls(links: Links, geoms: Sequence[LinkGeom], joint_pos: jax.Ar
         for geom in boxes:
             centre, axes, half_size = _box_of(geom)
             in_link = _moved(_inverse(matrices[geom.link]), edges)
-            found.append(_box_distance(jnp.matmul(in_link - centre, axes, precision="highest"), half_size))
+            found.append(_box_distance(jnp.matmul(in_link - centre[None, None], axes, precision="highest"), half_size))
     return jnp.min(jnp.concatenate(found))
 
 
@@ -89,6 +89,7 @@ def _box_distance(ends: jax.Array, half_size: np.ndarray) -> jax.Array:
 def _moved(matrices: jax.Array | np.ndarray, points: jax.Array | np.ndarray) -> jax.Array:
     """Return points [..., 2, 3] moved by matrices [..., 4, 4], in full float32."""
     matrices, points = jnp.asarray(matrices, jnp.float32), jnp.asarray(points, jnp.float32)
+    matrices = jnp.expand_dims(matrices, tuple(range(points.ndim - matrices.ndim)))
     turned = jnp.sum(matrices[..., None, :3, :3] * points[..., None, :], axis=-1)
     return turned + matrices[..., None, :3, 3]
 

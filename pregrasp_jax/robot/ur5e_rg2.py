@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 
 from pregrasp_jax.robot import clearance, closing_region, description, kinematics
-from pregrasp_jax.robot.base import ClosingRegion, Eligibility, Robot, hand_pose_of
+from pregrasp_jax.robot.base import ClosingRegion, Eligibility, Robot, first_obstruction, hand_pose_of
 from pregrasp_jax.robot.links import LinkGeom, Links, make_links
 from pregrasp_jax.spaces.workspace import Workspace
-from pregrasp_jax.types import CTRL_DT, OBSTRUCTIONS, HandPose, HullBank
+from pregrasp_jax.types import CTRL_DT, HandPose, HullBank
 
 FINGER_CLOSED, FINGER_OPEN = (float(limit) for limit in description.joint_range(description.FINGER_JOINTS[0]))
 """rad. Commanding `FINGER_CLOSED` around an object saturates the actuator: it closes with constant force."""
@@ -106,11 +106,8 @@ def follow(
         "joint_limit": ~jnp.all(within, axis=-1),
         **_too_near(links, path, apertures, workspace),
     }
-    code = jnp.int32(0)
-    for name in reversed(holds):  # the first that holds is the reason
-        code = jnp.where(holds[name], OBSTRUCTIONS.index(name), code)
     lead = jnp.asarray(description.feed_forward()[:6], jnp.float32)[None]
-    return jnp.concatenate([path + lead * velocity, apertures[:, None]], axis=1), code
+    return jnp.concatenate([path + lead * velocity, apertures[:, None]], axis=1), first_obstruction(holds)
 
 
 def _too_near(links: Links, path: jax.Array, apertures: jax.Array, workspace: Workspace) -> dict[str, jax.Array]:

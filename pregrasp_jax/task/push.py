@@ -1,6 +1,10 @@
-"""The paper's push: a straight line at constant height, to any cell of the half ring ahead, open or closed."""
+"""The paper's push: a straight line at constant height, to any cell of the half ring ahead, open or closed.
+
+`straight_pushes` makes such pushes for any other choices of how the hand is held.
+"""
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +23,9 @@ SETTLE_TIME = 0.25
 APERTURE_TIME = 0.5
 """s for the fingers to open or close before a push that changes the aperture."""
 
+TURN_SPEED = 1.5
+"""rad/s, mean speed of a turn: a push that turns the hand farther than its length has time for takes longer."""
+
 
 def make_push(robot: Robot, workspace: Workspace, task: TaskConfig, *, max_distance: float) -> Primitive:
     """Return pushes with the hand held as at the start, closed (choice 0) or open (choice 1).
@@ -30,11 +37,37 @@ def make_push(robot: Robot, workspace: Workspace, task: TaskConfig, *, max_dista
         max_distance: m, longest push that is planned; a longer one is refused.
     """
     actions = push_actions(robot)
-    num_rows = num_push_rows(max_distance, task.push_speed)
 
     def mask(hand: HandPose) -> jax.Array:
         ring = grid.half_ring(hand.xy, r_in=task.r_in, r_out=task.r_out, yaw=hand.yaw, full=task.full_ring)
         return jnp.broadcast_to(ring[..., None], actions.shape)
+
+    return straight_pushes("push", actions, mask, robot, workspace, task, max_distance=max_distance)
+
+
+def straight_pushes(
+    name: str,
+    actions: ActionSpace,
+    mask: Callable[[HandPose], jax.Array],
+    robot: Robot,
+    workspace: Workspace,
+    task: TaskConfig,
+    *,
+    max_distance: float,
+) -> Primitive:
+    """Return straight lines from where the hand is to a cell, held as the choice says.
+
+    Args:
+        name: as in `TaskConfig.primitive`.
+        actions: choices of height, heading and aperture; they change on the way.
+        mask: (hand) -> [H, W, K] bool, which actions are allowed next.
+        robot: who pushes.
+        workspace: where.
+        task: speed.
+        max_distance: m, longest push that is planned; a longer one is refused.
+    """
+    turns = len({choice.yaw for choice in actions.choices}) > 1
+    num_rows = num_push_rows(max_distance, task.push_speed, max_turn=math.pi if turns else 0.0)
 
     def decode(hand: HandPose, action: jax.Array) -> Stroke:
         xy, choice = actions.decode(action)
@@ -44,7 +77,7 @@ def make_push(robot: Robot, workspace: Workspace, task: TaskConfig, *, max_dista
     def plan(joint_pos: jax.Array, stroke: Stroke) -> Plan:
         return plan_push(robot, workspace, joint_pos, stroke, push_speed=task.push_speed, num_rows=num_rows)
 
-    return Primitive(name="push", actions=actions, mask=mask, decode=decode, plan=plan)
+    return Primitive(name=name, actions=actions, mask=mask, decode=decode, plan=plan)
 
 
 def push_actions(robot: Robot) -> ActionSpace:
@@ -55,9 +88,10 @@ def push_actions(robot: Robot) -> ActionSpace:
     return ActionSpace(choices, mirrored=(0, 1))
 
 
-def num_push_rows(max_distance: float, push_speed: float) -> int:
-    """Return the static number of control rows T that a push of at most `max_distance` m needs."""
-    return math.ceil((APERTURE_TIME + max_distance / push_speed + SETTLE_TIME) / CTRL_DT) + 1
+def num_push_rows(max_distance: float, push_speed: float, *, max_turn: float = 0.0) -> int:
+    """Return the static number of control rows T that a push of at most `max_distance` m and `max_turn` rad needs."""
+    duration = max(max_distance / push_speed, max_turn / TURN_SPEED)
+    return math.ceil((APERTURE_TIME + duration + SETTLE_TIME) / CTRL_DT) + 1
 
 
 def plan_push(
@@ -69,7 +103,7 @@ def plan_push(
     push_speed: float,
     num_rows: int,
 ) -> Plan:
-    """Plan a straight push: change the aperture if it differs, move, stand still.
+    """Plan a straight push: change the aperture if it differs, move and turn, stand still.
 
     Args:
         robot: who pushes.
@@ -82,10 +116,10 @@ def plan_push(
     start, end = stroke.start, stroke.end
     distance = jnp.linalg.norm(end.xy - start.xy)
     wait = jnp.where(jnp.abs(end.aperture - start.aperture) < 1e-6, 0.0, APERTURE_TIME)
-    duration = jnp.maximum(distance / push_speed, CTRL_DT)
+    turn = jnp.mod(end.yaw - start.yaw + jnp.pi, 2 * jnp.pi) - jnp.pi
+    duration = jnp.maximum(jnp.maximum(distance / push_speed, jnp.abs(turn) / TURN_SPEED), CTRL_DT)
     time = CTRL_DT * jnp.arange(num_rows)
     share = minimum_jerk((time - wait) / duration)
-    turn = jnp.mod(end.yaw - start.yaw + jnp.pi, 2 * jnp.pi) - jnp.pi
     path = HandPose(
         xy=start.xy[None] + share[:, None] * (end.xy - start.xy)[None],
         z=start.z + share * (end.z - start.z),

@@ -128,15 +128,15 @@ def test_a_training_survives_a_full_disk_and_saves_again_when_there_is_room(tmp_
     said, path = text_io.StringIO(), tmp_path / "disk" / "run"
     with disk(tmp_path / "disk") as full:
         trainer = make_trainer(path, CONFIG, said=said)
-        with trainer.folder:
+        with trainer.recorder.folder:
             trainer.run(stop_after(1))
             before = listing(path / "checkpoints")
             with full():
                 trainer.run(stop_after(2))
-                assert not trainer.saved
+                assert not trainer.recorder.saved
                 assert listing(path / "checkpoints") == before, "no half is left"
             trainer.run(stop_after(1))
-            assert trainer.saved
+            assert trainer.recorder.saved
         warnings = [line for line in said.getvalue().splitlines() if "no checkpoint" in line]
         assert warnings[:2] == [
             f"warning: no checkpoint written at step {step} ({FULL}: {path}); the last checkpoint is of step {STEP}"
@@ -215,7 +215,7 @@ def test_an_old_chunk_that_is_lost_costs_what_refers_to_it_and_the_run_goes_on(t
         r"warning: [1-9]\d* observations are lost, and [1-9]\d* transitions with them; the run .*", lost
     )
     assert resuming.startswith(f"resuming {path} at step 15, episode ")
-    with trainer.folder:
+    with trainer.recorder.folder:
         trainer.run(never)
     assert make_trainer(path, CONFIG, resume=True, said=console).progress.episodes >= CONFIG.train.episodes
     assert console.getvalue().count("observations are lost") == 1
@@ -226,11 +226,11 @@ def test_a_policy_that_could_not_be_written_is_not_the_best(tmp_path):
     said, path, scores = text_io.StringIO(), tmp_path / "disk" / "run", iter([0.3, 0.9, 0.5])
     with pretended_disk(tmp_path / "disk") as full:
         trainer = make_trainer(path, CONFIG, said=said)
-        trainer.evaluate_fn = lambda params: {"success_rate": next(scores)}
+        trainer.recorder.evaluate_fn = lambda params: {"success_rate": next(scores)}
         for disk in (nullcontext(), full(), nullcontext()):
             with disk:
-                trainer._step(trainer.program)
-                trainer.evaluate()
+                trainer.step(trainer.program)
+                trainer.recorder.evaluate(trainer.average())
     assert [line.split(": ")[1] for line in said.getvalue().splitlines() if line.startswith("validation")] == [
         "success 30% (best 30%)",
         "success 90% (best 30%)",
@@ -243,4 +243,4 @@ def test_a_run_goes_on_from_the_checkpoint_before_the_damaged_one_as_if_nothing_
     shutil.copytree(stopped, tmp_path / "run")
     flip_byte(tmp_path / "run" / "checkpoints" / "000000015" / "state.safetensors")
     assert checksum(run(tmp_path / "run", CONFIG, resume=True).state) == checksum(whole.state)
-    assert timeless(tmp_path / "run") == timeless(whole.folder.path)
+    assert timeless(tmp_path / "run") == timeless(whole.recorder.folder.path)

@@ -79,16 +79,16 @@ def test_a_training_counts_such_scenes_and_goes_on(trainer):
         poisoned.append(len(poisoned) % 3 == 0)
         return False
 
-    with trainer.folder:
+    with trainer.recorder.folder:
         assert trainer.run(poison_every_third_step).startswith("done: ")
-    log = [row for row in rows(trainer.folder.path) if "train/loss" in row]
+    log = [row for row in rows(trainer.recorder.folder.path) if "train/loss" in row]
     assert [row["physics/diverged"] for row in log] == [row["reasons/nan"] for row in log]
     logged_steps = log[-1]["env_steps"] // trainer.config.train.num_envs
     assert sum(row["reasons/nan"] for row in log) == sum(poisoned[:logged_steps]) > 2
     losses = [row["train/loss"] for row in log if row["train/loss"] is not None]
     assert len(losses) > 2 and np.isfinite(losses).all()
     num_reports = sum(row["reasons/nan"] > 0 for row in log)
-    dumps = [load_dump(path) for path in sorted(trainer.folder.dumps.iterdir())]
+    dumps = [load_dump(path) for path in sorted(trainer.recorder.folder.dumps.iterdir())]
     assert len(dumps) in (num_reports, num_reports + 1), "one for each report, and what came after the last"
     for dumped in dumps:
         assert np.isnan(dumped.arrays["state/centroids"][0, 0]), "the state is that before the push"
@@ -108,7 +108,7 @@ def collect_poisoned(path: Path, steps: int, **options: Any) -> tuple[Trainer, l
         trainer.state = dataclasses.replace(trainer.state, actors=poison(trainer.state.actors))
         return next(left, None) is None
 
-    with trainer.folder:
+    with trainer.recorder.folder:
         trainer.run(poison_every_step)
     return trainer, [line for line in said.getvalue().splitlines() if "no dump" in line or "replay-dump" in line]
 
@@ -116,18 +116,18 @@ def collect_poisoned(path: Path, steps: int, **options: Any) -> tuple[Trainer, l
 def test_a_run_writes_no_more_than_so_many_dumps(tmp_path, monkeypatch):
     monkeypatch.setattr(dump, "MAX_DUMPS", 2)
     trainer, said = collect_poisoned(tmp_path / "run", 4)
-    names = sorted(path.name for path in trainer.folder.dumps.iterdir())
+    names = sorted(path.name for path in trainer.recorder.folder.dumps.iterdir())
     assert names == ["step-000003-scene-1.npz", "step-000006-scene-1.npz"]
     assert said == [
         f"the physics diverged at step {step} in scene 1; `pregrasp-jax replay-dump "
-        f"{trainer.folder.dumps / name}` repeats the push"
+        f"{trainer.recorder.folder.dumps / name}` repeats the push"
         for step, name in zip((3, 6), names, strict=True)
     ]
-    assert sum(row.get("physics/diverged", 0) for row in rows(trainer.folder.path)) == 4, "all are counted"
+    assert sum(row.get("physics/diverged", 0) for row in rows(trainer.recorder.folder.path)) == 4, "all are counted"
     mishap = trainer.state.actors.mishap.replace(scene=jnp.int32(1))
-    assert trainer.dump_fn(trainer.folder.dumps, mishap.replace(env_steps=jnp.int32(9))) is None
-    again = trainer.dump_fn(trainer.folder.dumps, mishap.replace(env_steps=jnp.int32(6)))
-    assert again == trainer.folder.dumps / names[1], "a resumed run writes what it wrote before"
+    assert trainer.recorder.dump_fn(trainer.recorder.folder.dumps, mishap.replace(env_steps=jnp.int32(9))) is None
+    again = trainer.recorder.dump_fn(trainer.recorder.folder.dumps, mishap.replace(env_steps=jnp.int32(6)))
+    assert again == trainer.recorder.folder.dumps / names[1], "a resumed run writes what it wrote before"
 
 
 def test_a_dump_that_does_not_fit_is_one_warning_and_leaves_no_half(tmp_path, monkeypatch):
@@ -142,4 +142,4 @@ def test_a_dump_that_does_not_fit_is_one_warning_and_leaves_no_half(tmp_path, mo
         f"warning: no dump written at step {step} (No space left on device: {path}); the last checkpoint is of step 0"
         for step in (3, 6)
     ]
-    assert not list(trainer.folder.dumps.iterdir()) and len(rows(path)) == 2
+    assert not list(trainer.recorder.folder.dumps.iterdir()) and len(rows(path)) == 2

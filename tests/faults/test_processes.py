@@ -61,7 +61,7 @@ def go_on(path: Path) -> tuple[Trainer, list[str]]:
 
 def assert_equal_runs(trainer: Trainer, whole: Trainer) -> None:
     assert checksum(trainer.state) == checksum(whole.state)
-    assert timeless(trainer.folder.path) == timeless(whole.folder.path)
+    assert timeless(trainer.recorder.folder.path) == timeless(whole.recorder.folder.path)
 
 
 # The warm-up is 9 pushes, so that updates are due in the steps 5 and 6 of 3 pushes. The checkpoint of step 0 has no
