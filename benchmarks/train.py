@@ -92,7 +92,7 @@ def measure(config: Config) -> dict[str, Any]:
     }
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        save(Path(folder), 1, state.split()[0], state.ring(), {})
+        save(Path(folder), 1, state.split()[0], state.ring(), {}, policy=POLICY)
     ms["checkpoint"] = 1e3 * (time.perf_counter() - start)
     # Last, because they take the memory and give it back changed, as in training: a copy would cost more than the work.
     remember = Chain(program.remember, learning)

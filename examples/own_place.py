@@ -45,7 +45,7 @@ def draw(env: Env, path: Path) -> None:
     """Write a view of the first scene."""
     state = jax.jit(env.reset_to)(jnp.int32(0))
     view = drawing.draw_camera(env_hulls(env, state), target_slot=int(state.scene.target))
-    drawing.save_png(path, view)
+    drawing.save_image(path, view)
 
 
 def main(*, scenes: int = 50, num_envs: int = 16, picture: Path | None = None) -> dict[str, EvaluationResult]:

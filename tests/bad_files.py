@@ -73,7 +73,7 @@ def make_bad_runs(folder: Path) -> None:
     large = dataclasses.replace(make_config(), replay=ReplayConfig(capacity=1_000_000))
     for name, config in {"foreign": make_config(), "damaged": make_config(), "large": large}.items():
         write_config(folder / name / "config.yaml", config)
-        save(folder / name / "checkpoints", 7, {"colour": np.zeros(3)}, ring, {})
+        save(folder / name / "checkpoints", 7, {"colour": np.zeros(3)}, ring, {}, policy="")
         (folder / name / "manifest.json").write_text(json.dumps({"hashes": FAKE_HASHES, "sessions": []}))
     flip_last_byte(folder / "damaged" / "checkpoints" / "000000007" / "state.safetensors")
 

@@ -323,7 +323,7 @@ def test_table_tells_how_hulls_fit_and_what_is_not_used():
     loaded = LoadedDir(
         bank, notes=[Note("a.stl", fits["a"].remark())], fits=fits, unused=["a.mtl: only shapes are read"]
     )
-    table = format_table(loaded).splitlines()
+    table = format_table(loaded, [""] * len(bank.names)).splitlines()
     said = (
         "hulls against meshes: extents differ by 0.0 mm (median) to 2.0 mm (a), volumes by 7.0 % (median) to 10.0 % (a)"
     )

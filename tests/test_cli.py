@@ -23,7 +23,7 @@ from pregrasp_jax.cli import commands, doctor, progress
 from pregrasp_jax.cli import evaluate as evaluate_module
 from pregrasp_jax.cli.evaluate import evaluate
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.config import PRESETS, AssetsConfig, Config, PhysicsConfig, SceneConfig, TaskConfig
+from pregrasp_jax.config import PRESETS, AssetsConfig, Config, PhysicsConfig, SceneConfig, TaskConfig, TaskOverrides
 from pregrasp_jax.evaluation import player
 from pregrasp_jax.evaluation.player import EvaluationConfig, make_player, run_evaluation
 from pregrasp_jax.learning.networks import QNetwork
@@ -67,7 +67,7 @@ def test_evaluate_understands_the_documented_line(run: Any, requests: list) -> N
     assert request == EvaluationConfig(
         policy="straight",
         assets=AssetsConfig(object_dir="meshes", object_set="unseen"),
-        camera="pinhole",
+        task=TaskOverrides(camera="pinhole"),
         physics=PhysicsConfig(engine="native"),
         episodes=30,
         seed=4,
@@ -136,19 +136,20 @@ def test_a_trained_policy_keeps_its_task_and_meets_everybodys_scenes(fake_world:
 
 
 def test_requests_override_the_camera_and_more_episodes_need_more_scenes(fake_world: list[Config]) -> None:
-    make_player(EvaluationConfig(policy="clear", camera="pinhole", r_out=0.2, episodes=300))
+    make_player(EvaluationConfig(policy="clear", task=TaskOverrides(camera="pinhole", r_out=0.2), episodes=300))
     assert fake_world[0].task == TaskConfig(camera="pinhole", r_out=0.2)
     assert fake_world[0].scene.test_scenes == 300
 
 
 def test_a_smaller_ring_changes_where_the_shipped_policy_may_push_not_what_it_sees(fake_world: list[Config]) -> None:
-    usual, narrow = (make_player(EvaluationConfig(policy="pretrained", r_out=r_out)) for r_out in (None, 0.12))
+    tasks = (TaskOverrides(r_out=r_out) for r_out in (None, 0.12))
+    usual, narrow = (make_player(EvaluationConfig(policy="pretrained", task=task)) for task in tasks)
     state = usual.env.reset_to(jax.numpy.int32(0))
     assert usual.q_values is not None and narrow.q_values is not None
     np.testing.assert_array_equal(usual.q_values(state), narrow.q_values(state))
     assert narrow.env.action_mask(state.hand).sum() < usual.env.action_mask(state.hand).sum()
     with pytest.raises(ValueError, match=r"r_out = 0.25 is out of range; allowed for this policy, .* is 0.04 to 0.2"):
-        make_player(EvaluationConfig(policy="pretrained", r_out=0.25))
+        make_player(EvaluationConfig(policy="pretrained", task=TaskOverrides(r_out=0.25)))
 
 
 def test_the_shipped_policy_has_a_name(fake_world: list[Config]) -> None:

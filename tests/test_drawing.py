@@ -141,7 +141,10 @@ def test_contact_sheet_shows_the_tallest_object_whole():
         np.asarray(trimesh.creation.box((0.2, 0.2, height)).vertices) + np.array([0, 0, height / 2])
         for height in (0.30, 0.02)
     )
-    pictures = [drawing.contact_sheet(make_bank([ConvexObject("x", [part])]))[8:228, 8:228] for part in (tall, low)]
+    pictures = [
+        drawing.contact_sheet(make_bank([ConvexObject("x", [part])]), np.array([True]))[8:228, 8:228]
+        for part in (tall, low)
+    ]
     differs = (pictures[0] != pictures[1]).any(axis=2)
     assert differs[60:].any() and not differs[:3].any() and not differs[:, :3].any() and not differs[:, -3:].any()
 

@@ -14,9 +14,10 @@ import pytest
 import trimesh
 
 from pregrasp_jax import io, startup
-from pregrasp_jax.cli import commands, doctor, player, replay, report
-from pregrasp_jax.config import Config
-from pregrasp_jax.env import make_env
+from pregrasp_jax.cli import commands, doctor, replay, report
+from pregrasp_jax.config import Config, EvaluationConfig
+from pregrasp_jax.evaluation import player
+from pregrasp_jax.task.env import make_env
 from pregrasp_jax.training import session
 
 ROOT = Path(__file__).parent.parent
@@ -79,7 +80,7 @@ def test_an_environment_without_means_is_one_line(tmp_path, row):
 ENTRY_POINTS = {
     "train": lambda path: session.train(Config(), path / "run"),
     "resume": lambda path: session.resume(Config(), path / "run"),
-    "evaluate, show, demo": lambda path: player.make_player(player.EvaluationConfig(policy="pretrained")),
+    "evaluate, show, demo": lambda path: player.make_player(EvaluationConfig(policy="pretrained")),
     "assets": lambda path: commands.assets(png=path / "a.png"),
     "scenes": lambda path: commands.scenes(),
     "replay-dump": lambda path: replay.replay_dump(path / "dump.npz"),

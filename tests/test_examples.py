@@ -22,7 +22,8 @@ CODE = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "extend.md").read_t
 @pytest.fixture(autouse=True)
 def registries():
     """Leave the registries as they were: what examples add must not reach other tests."""
-    kept = [(registry, dict(registry)) for registry in (ROBOTS, WORKSPACES, KINDS)]
+    registries: list[dict] = [ROBOTS, WORKSPACES, KINDS]
+    kept = [(registry, dict(registry)) for registry in registries]
     yield
     for registry, items in kept:
         registry.clear()

@@ -141,7 +141,7 @@ def test_the_iteration_stays_on_an_accelerator(training):
 
 def test_with_the_native_engine_it_does_not():
     """So the test above can fail. JAX refuses to lower a callback for a platform that this machine does not have."""
-    engine = native.make_engine(builtin_bank("seen"))
+    engine = native.make_engine(builtin_bank("seen"), ROBOT, TABLE)
     assert host_calls(make_program(make_env(NUM_SLOTS, FEW, engine=engine)), "cpu")
 
 

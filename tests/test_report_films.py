@@ -21,6 +21,7 @@ from pregrasp_jax.cli.report import report, report_session
 from pregrasp_jax.config import PRESETS
 from pregrasp_jax.evaluation import player
 from pregrasp_jax.learning.networks import QNetwork
+from pregrasp_jax.report.play import SECONDS_PER_FRAME
 
 LONG = [evaluation_row(300, report_module.WORTH_FILMS, 0.75, [0.5, 0.9])]
 """Metrics of a training after which films are made."""
@@ -239,7 +240,7 @@ def test_the_demo_begins_with_the_shipped_policy_at_work(drawn: list[Any], tmp_p
     with Image.open(gif) as film:
         # Equal panels, as they are here, become one that is shown longer.
         shown = sum(frame.info["duration"] for frame in ImageSequence.Iterator(film))
-    assert shown == 1e3 * film_module.SECONDS_PER_FRAME * len(drawn)
+    assert shown == 1e3 * SECONDS_PER_FRAME * len(drawn)
     assert text.count("<article>") == 3 and text.count("<li>") == len(drawn)
     badges = re.findall(r'<span class="(good|bad)">', text)
     assert sorted(badges, reverse=True) == badges and {"good", "bad"} == set(badges)

@@ -153,10 +153,9 @@ def test_a_file_that_cannot_be_read_is_one_line(tmp_path):
 def begun(tmp_path) -> tuple[Path, Config]:
     """Return a run that has begun and has a checkpoint, with its configuration."""
     path, config = tmp_path / "run", make_config()
-    trainer = make_trainer(path, config, begin=False)
-    with trainer.recorder.folder as folder:
+    with RunFolder.create(path, config) as folder:
         folder.begin_session(config, {})
-        trainer.begin()
+        trainer = make_trainer(path, config, folder=folder)
         trainer.run(fake_training.stop_after(2))
     return path, config
 

@@ -15,7 +15,7 @@ import pytest
 from fake_training import PictureEnv, make_trainer, never, run, timeless
 from sharded_training import EPISODES, make_config
 
-from pregrasp_jax.checkpoint.state import read_newest_arrays
+from pregrasp_jax.checkpoint import trees
 from pregrasp_jax.config import PhysicsConfig
 from pregrasp_jax.training import processes, sharding
 from pregrasp_jax.training.run_folder import RunFolder, WatchedFolder
@@ -53,7 +53,8 @@ def _assert_equal_runs(got: Path, expected: Path) -> None:
     for row, wanted in zip(*rows, strict=True):
         for name, value in wanted.items():
             assert row[name] == (value if value is None else pytest.approx(value, rel=RTOL, abs=ATOL)), name
-    arrays, wanted = (read_newest_arrays(path / "checkpoints")[0] for path in (got, expected))
+    files = [max(path.glob("checkpoints/*/state.safetensors")) for path in (got, expected)]
+    arrays, wanted = (trees.decode(file.read_bytes(), origin=str(file)) for file in files)
     assert arrays.keys() == wanted.keys() and int(wanted["learning/learner/gradient_steps"]) > 20
     for name, value in wanted.items():
         if value.dtype == np.float32:
@@ -202,13 +203,10 @@ def test_a_watched_folder_is_only_read(tmp_path):
     with RunFolder.create(tmp_path / "run", config) as folder:
         folder.begin_session(config, {})
         before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-        trainer = make_trainer(
-            tmp_path / "run", config, begin=False, env=PictureEnv(), folder=WatchedFolder(folder.path)
-        )
-        with trainer.recorder.folder:
-            trainer.recorder.folder.begin_session(config, {"hull bank": "another"})
-            trainer.begin()
+        with WatchedFolder(folder.path) as watched:
+            watched.begin_session(config, {"hull bank": "another"})
+            trainer = make_trainer(tmp_path / "run", config, env=PictureEnv(), folder=watched)
             trainer.run(never)
-            trainer.recorder.folder.forget_metrics_after(0, evaluated_at=None)
+            watched.forget_metrics_after(0, evaluated_at=None)
         assert trainer.recorder.saved and trainer.recorder.counters.best == 0.25
         assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before

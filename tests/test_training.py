@@ -111,7 +111,7 @@ def test_same_seed_same_metrics(tmp_path, finished):
 def test_interrupted_and_resumed_equals_uninterrupted(tmp_path, finished):
     path = tmp_path / "halves"
     first = run(path, finished.config, stop=stop_after(7))
-    assert first.progress.env_steps == 7 * 3 and first.saved
+    assert first.recorder.counters.env_steps == 7 * 3 and first.recorder.saved
     second = run(path, finished.config, resume=True)
     assert checksum(second.state) == checksum(finished.state)
     assert timeless(path) == timeless(finished.recorder.folder.path)
@@ -151,7 +151,7 @@ def test_a_run_can_be_extended_but_not_changed(tmp_path):
         assert stored_config(path) == config, "until objects, scenes and resources have been found to do"
         folder.begin_session(longer, {})
         assert stored_config(path) == longer
-    assert run(path, longer, resume=True).progress.episodes >= 14 > first.progress.episodes
+    assert run(path, longer, resume=True).recorder.counters.episodes >= 14 > first.recorder.counters.episodes
     changed = dataclasses.replace(longer, exploration=ExplorationConfig(guided=False))
     with pytest.raises(ValueError, match=r"exploration.guided: True -> False.*allowed to change: train.minutes"):
         RunFolder.open(path, changed)
@@ -318,7 +318,7 @@ def test_a_push_is_traced_once_for_shapes_start_and_compilation_and_its_overflow
 def test_a_run_of_fused_iterations_measures_what_the_loop_does(tmp_path, finished):
     """Two pushes of every scene in one program: the same rows, except where float32 adds in another order."""
     fused = run(tmp_path / "fused", make_config(episodes=24, fused_iterations=2))
-    logs = [[row for row in timeless(t.folder.path) if "train/loss" in row] for t in (finished, fused)]
+    logs = [[row for row in timeless(t.recorder.folder.path) if "train/loss" in row] for t in (finished, fused)]
     pairs = list(zip(*logs, strict=False))
     assert len(pairs) > 5
     for expected, got in pairs:

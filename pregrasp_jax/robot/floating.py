@@ -1,7 +1,7 @@
 """Hands without an arm: any hand given as MJCF, carried by three slides and a hinge about z.
 
-Where the arm is not the question (another gripper, a tool, a first look at an idea), a hand needs no inverse kinematics.
-Its pose is its joint positions.
+Where the arm is not the question (another gripper, a tool, a first look at an idea), a hand needs no inverse
+kinematics: its pose is its joint positions.
 """
 
 import functools

@@ -63,7 +63,7 @@ def test_whichever_file_of_a_checkpoint_does_not_fit_the_last_one_stays_and_no_h
     def write(step: int, written: int, best: float) -> Path:
         slots = np.arange(8, dtype=np.uint8)
         ring = Ring({"height": jnp.asarray(np.where(slots < written, slots, 0))}, written)
-        return save(tmp_path, step, {"a": jnp.arange(2) + step}, ring, {"best": best})
+        return save(tmp_path, step, {"a": jnp.arange(2) + step}, ring, {"best": best}, policy="a")
 
     write(1, 3, 0.1)
     write(2, 6, 0.2)
@@ -147,9 +147,10 @@ def test_a_training_survives_a_full_disk_and_saves_again_when_there_is_room(tmp_
 
 def test_a_run_that_cannot_write_its_first_checkpoint_does_not_begin(tmp_path):
     with pretended_disk(tmp_path / "disk") as full:
-        trainer = make_trainer(tmp_path / "disk" / "run", CONFIG, begin=False)
-        with full(), pytest.raises(ValueError, match=r"no checkpoint can be written to .*run; allowed is a"):
-            trainer.begin()
+        path = tmp_path / "disk" / "run"
+        folder = RunFolder.create(path, CONFIG)
+        with folder, full(), pytest.raises(ValueError, match=r"no checkpoint can be written to .*run; allowed is a"):
+            make_trainer(path, CONFIG, folder=folder)
 
 
 def test_a_row_of_metrics_that_does_not_fit_leaves_no_half(tmp_path):
@@ -195,7 +196,7 @@ def test_damage_costs_one_checkpoint_and_is_said(tmp_path, stopped, victim, dama
     file = path / "checkpoints" / victim.format(newest=newest)
     damage(file)
     console = text_io.StringIO()
-    with make_trainer(path, CONFIG, resume=True, said=console).folder:
+    with make_trainer(path, CONFIG, resume=True, said=console).recorder.folder:
         first, second = console.getvalue().splitlines()
     assert first == f"warning: {said.format(file=file)}; going on from the checkpoint of step 12"
     assert second.startswith(f"resuming {path} at step 12, episode ")
@@ -217,7 +218,8 @@ def test_an_old_chunk_that_is_lost_costs_what_refers_to_it_and_the_run_goes_on(t
     assert resuming.startswith(f"resuming {path} at step 15, episode ")
     with trainer.recorder.folder:
         trainer.run(never)
-    assert make_trainer(path, CONFIG, resume=True, said=console).progress.episodes >= CONFIG.train.episodes
+    again = make_trainer(path, CONFIG, resume=True, said=console)
+    assert again.recorder.counters.episodes >= CONFIG.train.episodes
     assert console.getvalue().count("observations are lost") == 1
 
 
