@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pregrasp_jax.assets import columns, fit
+from pregrasp_jax.assets import columns, decompose, fit
 from pregrasp_jax.assets.decompose import finish, repair
 from pregrasp_jax.assets.fit import Fit, compare, fit_parts
 from pregrasp_jax.assets.standing import better_axes, doubt
@@ -12,7 +12,7 @@ from pregrasp_jax.assets.standing import better_axes, doubt
 
 def revolve(*profile: tuple[float, float]) -> trimesh.Trimesh:
     """Return a solid of revolution of (radius, z) in mm."""
-    return trimesh.creation.revolve(np.array(profile) / 1000, sections=48)
+    return trimesh.creation.revolve(np.array(profile) / 1000, sections=24)
 
 
 def box(size: tuple[float, float, float], center: tuple[float, float, float]) -> trimesh.Trimesh:
@@ -50,7 +50,7 @@ def test_columns_hold_the_volume(mesh, volume):
     mesh.fix_normals()
     found, area = cut(mesh)
     assert found.known.all()
-    assert found.length.sum() * area == pytest.approx(volume, rel=0.01)
+    assert found.length.sum() * area == pytest.approx(volume, rel=0.02)
 
 
 def test_the_floor_closes_a_base_that_is_missing():
@@ -105,6 +105,8 @@ def test_small_differences_need_no_remark():
 
 
 def test_a_closed_mesh_that_crosses_itself_keeps_its_size(monkeypatch):
+    for quick, value in {"threshold": 0.3, "resolution": 200, "mcts_nodes": 5, "mcts_iterations": 5}.items():
+        monkeypatch.setitem(decompose._COACD, quick, value)
     mesh = repair(revolve(*FOLDED_CAN))
     assert mesh.is_watertight and mesh.body_count == 1
     candidates = list(fit._candidates(mesh))

@@ -2,7 +2,7 @@
 
 The volume that the divergence theorem gives is wrong where surfaces cross themselves, where bodies overlap (they count
 twice) and where there are holes. A column is inside where the surface winds around it, and is left out where that does
-not work out.
+not work out. Where only the base is missing, as in scans of what stood on a table, the floor closes it.
 """
 
 from typing import NamedTuple
