@@ -111,11 +111,12 @@ def test_a_closed_mesh_that_crosses_itself_keeps_its_size(monkeypatch):
     assert mesh.is_watertight and mesh.body_count == 1
     candidates = list(fit._candidates(mesh))
     assert len(candidates) == 3
-    assert compare(mesh, finish(candidates[1])).off > 1e-3  # as CoACD returns them, and as `decompose` takes them
+    remeshed = compare(mesh, finish(candidates[1]))  # as CoACD returns them, and as `decompose` takes them
+    assert remeshed.off > 1e-3
     monkeypatch.setattr(fit, "_candidates", lambda mesh: iter(candidates))
     parts, found = fit_parts(mesh)
     np.testing.assert_allclose(np.ptp(np.concatenate(parts), axis=0), mesh.extents, atol=1e-3)
-    assert found.difference < 0.15
+    assert found.difference <= remeshed.difference
 
 
 def test_each_body_that_is_convex_is_a_part():
