@@ -55,12 +55,12 @@ def distance_to_walls(links: Links, geoms: Sequence[LinkGeom], joint_pos: jax.Ar
     found = []
     for wall in workspace.walls:
         into_wall = _inverse_pose(wall)
-        found.append(_box_distance(_moved(into_wall, ends), np.array(wall.half_size)) - radius)
+        found.append(_box_distance(_moved(into_wall[None], ends), np.array(wall.half_size)) - radius)
         edges = jnp.asarray(wall.corners()[_BOX_EDGES], jnp.float32)
         for geom in boxes:
             centre, axes, half_size = _box_of(geom)
-            in_link = _moved(_inverse(matrices[geom.link]), edges)
-            found.append(_box_distance(jnp.matmul(in_link - centre, axes, precision="highest"), half_size))
+            in_link = _moved(_inverse(matrices[geom.link])[None], edges)
+            found.append(_box_distance(jnp.matmul(in_link - centre[None, None], axes, precision="highest"), half_size))
     return jnp.min(jnp.concatenate(found))
 
 
