@@ -168,8 +168,8 @@ def _advance(env: Env, plans: _Plans, actions: jax.Array) -> _Plans:
     values = jnp.where(held, _SUCCESS, jnp.where(results.terminated, failed, -distance))
     return _Plans(
         depth=plans.depth + 1,
-        # No script looks at a picture: the old one spares drawing a new one.
-        states=states.replace(obs=plans.states.obs),
+        # No script looks at a picture: the old one spares drawing a new one. Where the hand is, they ask.
+        states=states.replace(obs=plans.states.obs.replace(hand=states.hand)),
         values=jnp.where(execute, values, plans.values),
         ended=plans.ended | (execute & (results.terminated | results.truncated)),
     )

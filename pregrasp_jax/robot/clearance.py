@@ -55,7 +55,7 @@ def distance_to_walls(links: Links, geoms: Sequence[LinkGeom], joint_pos: jax.Ar
     found = []
     for wall in workspace.walls:
         into_wall = _inverse_pose(wall)
-        found.append(_box_distance(_moved(into_wall, ends), np.array(wall.half_size)) - radius)
+        found.append(_box_distance(_moved(into_wall[None], ends), np.array(wall.half_size)) - radius)
         edges = jnp.asarray(wall.corners()[_BOX_EDGES], jnp.float32)
         for geom in boxes:
             centre, axes, half_size = _box_of(geom)
