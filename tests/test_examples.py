@@ -3,6 +3,7 @@
 import importlib.util
 import re
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -22,7 +23,8 @@ CODE = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "extend.md").read_t
 @pytest.fixture(autouse=True)
 def registries():
     """Leave the registries as they were: what examples add must not reach other tests."""
-    kept = [(registry, dict(registry)) for registry in (ROBOTS, WORKSPACES, KINDS)]
+    registries: tuple[dict[str, Any], ...] = (ROBOTS, WORKSPACES, KINDS)
+    kept = [(registry, dict(registry)) for registry in registries]
     yield
     for registry, items in kept:
         registry.clear()
