@@ -3,12 +3,15 @@
 import importlib.util
 import re
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 from pregrasp_jax.checkpoint import load_policy
+from pregrasp_jax.config import Config, SceneConfig
 from pregrasp_jax.robot import ROBOTS, get_robot
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.workspace import WORKSPACES
@@ -22,8 +25,12 @@ CODE = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "extend.md").read_t
 @pytest.fixture(autouse=True)
 def registries():
     """Leave the registries as they were: what examples add must not reach other tests."""
+<<<<<<< HEAD
     registries: list[dict] = [ROBOTS, WORKSPACES, KINDS]
     kept = [(registry, dict(registry)) for registry in registries]
+=======
+    kept: list[tuple[Any, dict[str, Any]]] = [(registry, dict(registry)) for registry in (ROBOTS, WORKSPACES, KINDS)]
+>>>>>>> values-examples
     yield
     for registry, items in kept:
         registry.clear()
@@ -53,12 +60,18 @@ def test_an_own_policy_is_evaluated_with_a_grasp(capsys):
     assert "of 2 scenes" in capsys.readouterr().out
 
 
-def test_an_own_place_changes_how_episodes_go(tmp_path, capsys):
+def test_an_own_place_has_a_wall_and_a_nearer_edge(tmp_path, capsys):
     module = load("own_place")
-    results = module.main(scenes=3, num_envs=3, picture=tmp_path / "place.png")
-    assert results["table"].episodes != results["narrow"].episodes
-    assert "narrow: " in capsys.readouterr().out
-    assert (tmp_path / "place.png").stat().st_size > 10_000
+    picture = tmp_path / "place.png"
+    results = module.main(scenes=2, num_envs=2, picture=picture)
+    assert [episode.scene for episode in results["narrow"].episodes] == [0, 1]
+    assert re.search(r"^narrow: \d+% of 2 scenes", capsys.readouterr().out, re.MULTILINE)
+    points = np.array([[0.0, -0.23, 0.1], [0.0, 0.26, 0.1]])
+    assert [list(WORKSPACES[name].has_left(points)) for name in results] == [[False, True], [True, False]]
+    pixels = np.asarray(Image.open(picture)).astype(int)
+    module.draw(module.make_place(Config(scene=SceneConfig(test_scenes=2)), "table"), picture)
+    changed = np.abs(pixels - np.asarray(Image.open(picture))).max(axis=-1) > 8
+    assert changed.mean() > 0.01, "the wall is not to be seen"
 
 
 def test_training_in_python_changes_parameters_and_keeps_them(tmp_path, capsys):
