@@ -124,14 +124,9 @@ class PreGraspVectorEnv(VectorEnv):
         if seed is None and self._state is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0] >> 1)
         if seed is not None:
-<<<<<<< HEAD
             seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, _INTEGER) else list(seed)
             numbers = [int(number) for number in seeds if isinstance(number, _INTEGER)]
             if not len(numbers) == len(seeds) == self.num_envs:
-=======
-            seeds: list[Any] = [seed + i for i in range(self.num_envs)] if isinstance(seed, _INTEGER) else list(seed)
-            if len(seeds) != self.num_envs or not all(isinstance(number, _INTEGER) for number in seeds):
->>>>>>> values-examples
                 raise ValueError(f"seed = {seed}; allowed is an int, or a list of {self.num_envs}")
             self._keys = jnp.stack([jax.random.key(number) for number in numbers])
             self._episodes = np.zeros(self.num_envs, np.int32)

@@ -25,12 +25,7 @@ CODE = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "extend.md").read_t
 @pytest.fixture(autouse=True)
 def registries():
     """Leave the registries as they were: what examples add must not reach other tests."""
-<<<<<<< HEAD
-    registries: list[dict] = [ROBOTS, WORKSPACES, KINDS]
-    kept = [(registry, dict(registry)) for registry in registries]
-=======
     kept: list[tuple[Any, dict[str, Any]]] = [(registry, dict(registry)) for registry in (ROBOTS, WORKSPACES, KINDS)]
->>>>>>> values-examples
     yield
     for registry, items in kept:
         registry.clear()
