@@ -72,6 +72,13 @@ print("loaded:", *(set(sys.modules) & set({HEAVY})))
     assert done.stdout.endswith("loaded:\n")
 
 
+def test_without_a_command_it_lists_them(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as exit_info:
+        main([])
+    assert exit_info.value.code == 2
+    assert capsys.readouterr().err == f"error: Expected one of {{{', '.join(COMMANDS)}}}.\n"
+
+
 def test_ctrl_c_is_one_line_and_its_exit_code(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     def interrupted() -> None:
         raise KeyboardInterrupt

@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: help was asked for (0), or something impossible (2).
     """
-    name, *options = arguments if arguments is not None else sys.argv[1:] or [""]
+    name, *options = (sys.argv[1:] if arguments is None else arguments) or [""]
     try:
         with one_line_errors():
             if name == "--version":
