@@ -1,6 +1,7 @@
 """Guided actions follow their density inside the mask; schedules and epsilon-greedy by hand."""
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -25,10 +26,15 @@ def ring(*, full: bool = False) -> np.ndarray:
     return mask
 
 
+def draw_many(draw_one: Callable[[jax.Array], jax.Array], keys: jax.Array) -> jax.Array:
+    """Return one draw per key, some hundred at a time: each takes a number for every cell of the map."""
+    return jax.lax.map(draw_one, keys, batch_size=500)
+
+
 @functools.partial(jax.jit, static_argnames="angle_std")
 def guided(keys: jax.Array, target: jax.Array, mask: jax.Array, angle_std: float) -> jax.Array:
-    draw_one = functools.partial(exploration.guided_action, angle_std=angle_std, open_probability=0.7)
-    return jax.vmap(draw_one, in_axes=(0, None, None, None))(keys, jnp.array(P1), target, mask)
+    options = {"angle_std": angle_std, "open_probability": 0.7}
+    return draw_many(lambda key: exploration.guided_action(key, jnp.array(P1), target, mask, **options), keys)
 
 
 def draw(dx: float, dy: float, *, angle_std: float = 0.5, mask: np.ndarray | None = None):
@@ -95,7 +101,7 @@ def test_an_empty_mask_still_gives_an_action():
 
 def test_random_actions_cover_the_whole_map_or_what_the_network_values_of_it():
     everywhere, keys = jnp.ones((100, 100), bool), jax.random.split(jax.random.key(1), 20_000)
-    draw = jax.jit(jax.vmap(exploration.random_action, (0, None)))
+    draw = jax.jit(lambda keys, mask: draw_many(lambda key: exploration.random_action(key, mask), keys))
     few = everywhere.at[:, :98].set(False)
     assert set(np.asarray(draw(keys, few)) % 200) == {196, 197, 198, 199}
     actions = np.asarray(draw(keys, everywhere))
@@ -122,8 +128,8 @@ def test_softmax_action_follows_its_distribution_inside_the_mask():
     mask = np.zeros((100, 100), bool)
     mask[3, 4] = mask[50, 60] = True
     q = jnp.full((100, 100, 2), 9.0).at[3, 4].set(jnp.array([0.1, 0.3])).at[50, 60].set(jnp.array([0.0, 0.2]))
-    draw = jax.vmap(lambda key: exploration.softmax_action(key, q, jnp.asarray(mask), temperature=0.1))
-    actions = np.asarray(draw(jax.random.split(jax.random.key(0), 4000)))
+    draw = functools.partial(exploration.softmax_action, q=q, mask=jnp.asarray(mask), temperature=0.1)
+    actions = np.asarray(draw_many(draw, jax.random.split(jax.random.key(0), 4000)))
     assert actions.dtype == np.int32
     weights = np.exp(np.array([1.0, 3.0, 0.0, 2.0]))
     cells = [2 * (3 * 100 + 4), 2 * (3 * 100 + 4) + 1, 2 * (50 * 100 + 60), 2 * (50 * 100 + 60) + 1]
