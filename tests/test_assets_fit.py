@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from pregrasp_jax.assets import columns, fit
-from pregrasp_jax.assets.decompose import repair
+from pregrasp_jax.assets import columns, decompose, fit
+from pregrasp_jax.assets.decompose import finish, repair
 from pregrasp_jax.assets.fit import Fit, compare, fit_parts
 from pregrasp_jax.assets.standing import better_axes, doubt
 
 
 def revolve(*profile: tuple[float, float]) -> trimesh.Trimesh:
     """Return a solid of revolution of (radius, z) in mm."""
-    return trimesh.creation.revolve(np.array(profile) / 1000, sections=48)
+    return trimesh.creation.revolve(np.array(profile) / 1000, sections=24)
 
 
 def box(size: tuple[float, float, float], center: tuple[float, float, float]) -> trimesh.Trimesh:
@@ -50,7 +50,17 @@ def test_columns_hold_the_volume(mesh, volume):
     mesh.fix_normals()
     found, area = cut(mesh)
     assert found.known.all()
-    assert found.length.sum() * area == pytest.approx(volume, rel=0.01)
+    assert found.length.sum() * area == pytest.approx(volume, rel=0.02)
+
+
+def test_the_floor_closes_a_base_that_is_missing():
+    """As scans are that stood on a table; with the wrong sign the box would be hollow."""
+    mesh = trimesh.creation.box((0.1, 0.1, 0.1))
+    mesh.update_faces(~(mesh.triangles[:, :, 2] < 0).all(axis=1))
+    found, _ = cut(mesh)
+    assert found.known.all() and found.length == pytest.approx(0.1)
+    parts, fitted = fit_parts(mesh)
+    assert len(parts) == 1 and fitted.is_good
 
 
 def test_columns_below_a_hole_are_not_known():
@@ -94,12 +104,19 @@ def test_small_differences_need_no_remark():
     assert again.remark() == made(0.0611, 0.9).remark()
 
 
-def test_a_closed_mesh_that_crosses_itself_keeps_its_size():
+def test_a_closed_mesh_that_crosses_itself_keeps_its_size(monkeypatch):
+    for quick, value in {"threshold": 0.3, "resolution": 200, "mcts_nodes": 5, "mcts_iterations": 5}.items():
+        monkeypatch.setitem(decompose._COACD, quick, value)
     mesh = repair(revolve(*FOLDED_CAN))
     assert mesh.is_watertight and mesh.body_count == 1
+    candidates = list(fit._candidates(mesh))
+    assert len(candidates) == 3
+    remeshed = compare(mesh, finish(candidates[1]))  # as CoACD returns them, and as `decompose` takes them
+    assert remeshed.off > 1e-3
+    monkeypatch.setattr(fit, "_candidates", lambda mesh: iter(candidates))
     parts, found = fit_parts(mesh)
     np.testing.assert_allclose(np.ptp(np.concatenate(parts), axis=0), mesh.extents, atol=1e-3)
-    assert found.difference < 0.15
+    assert found.difference <= remeshed.difference
 
 
 def test_each_body_that_is_convex_is_a_part():

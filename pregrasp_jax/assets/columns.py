@@ -2,7 +2,7 @@
 
 The volume that the divergence theorem gives is wrong where surfaces cross themselves, where bodies overlap (they count
 twice) and where there are holes. A column is inside where the surface winds around it, and is left out where that does
-not work out.
+not work out. Where only the base is missing, as in scans of what stood on a table, the floor closes it.
 """
 
 from typing import NamedTuple
@@ -54,6 +54,10 @@ def cut(vertices: np.ndarray, faces: np.ndarray, x: np.ndarray, y: np.ndarray) -
         The columns, y running faster; where the surface winds more than once around a point, it counts once.
     """
     column, height, step = _crossings(vertices[faces], x, y)
+    total = np.bincount(column, step, len(x) * len(y))
+    baseless = np.flatnonzero(np.abs(total + 1) < 0.5)
+    column, height = np.append(column, baseless), np.append(height, np.full(len(baseless), vertices[:, 2].min()))
+    step = np.append(step, np.ones(len(baseless)))
     bottom, top = np.full(len(x) * len(y), np.inf), np.full(len(x) * len(y), -np.inf)
     np.minimum.at(bottom, column, height)
     np.maximum.at(top, column, height)

@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from pregrasp_jax.assets import columns
-from pregrasp_jax.assets.decompose import cut, finish, refit, volume
+from pregrasp_jax.assets.decompose import cut, decompose, finish, refit, volume
 from pregrasp_jax.types import MAX_HULLS
 
 EXTENT_TOLERANCE = 1e-3
@@ -21,8 +21,11 @@ EXTENT_TOLERANCE = 1e-3
 VOLUME_TOLERANCE = 0.05
 """Share by which the volume may differ."""
 
-_MAX_STRETCH = 1.04
+_MAX_STRETCH = 1.06
 """More than simplification can have cost: what is missing then is a part, which stretching would not bring back."""
+
+_PRICE = 0.01
+"""Difference that one more part must save: every hull costs time in every step."""
 
 _MIN_KNOWN = 0.9
 """A mesh that is closed along fewer of its columns is too open to have a volume."""
@@ -90,12 +93,19 @@ def fit_parts(mesh: trimesh.Trimesh) -> tuple[tuple[np.ndarray, ...], Fit]:
     """
     tried: list[tuple[tuple[np.ndarray, ...], Fit]] = []
     for raw in _candidates(mesh):
-        parts = _stretched(finish(raw), np.ptp(mesh.vertices, axis=0))
-        tried.append((parts, compare(mesh, parts)))
-        if tried[-1][1].is_good:
+        tried.append(_fitted(mesh, finish(raw)))
+        fit = tried[-1][1]
+        if fit.is_good:
             return tried[-1]
-    # What is not known of an open mesh cannot choose: the refitted parts, which come last, follow its surface.
-    return min(reversed(tried), key=lambda found: np.nan_to_num(found[1].difference))
+        if np.isnan(fit.volume):  # of a mesh as open as this nothing is known that could choose
+            return _fitted(mesh, decompose(mesh))
+    return min(tried, key=lambda found: found[1].difference + _PRICE * len(found[0]))
+
+
+def _fitted(mesh: trimesh.Trimesh, parts: tuple[np.ndarray, ...]) -> tuple[tuple[np.ndarray, ...], Fit]:
+    """Stretch finished parts, and measure them."""
+    parts = _stretched(parts, np.ptp(mesh.vertices, axis=0))
+    return parts, compare(mesh, parts)
 
 
 def compare(mesh: trimesh.Trimesh, parts: tuple[np.ndarray, ...]) -> Fit:
