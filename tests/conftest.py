@@ -17,9 +17,6 @@ import pytest
 MAX_MB = 2000
 """Resident memory that a worker may ever have: four of them, and what they start, fit into 16 GB."""
 
-LARGE_MB = 800
-"""Resident memory above which compiled programs are dropped after every test, not only after every module."""
-
 PEAK = pytest.StashKey[int]()
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -37,9 +34,12 @@ def key() -> jax.Array:
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None]:
-    """Drop compiled programs once fixtures are gone, and fail the test with which the worker outgrew its limit."""
+    """Drop a module's programs once its fixtures are gone, and fail the test with which the worker outgrew its limit.
+
+    Not after every test: modules share compiled functions among their tests, and some count how often these are traced.
+    """
     yield
-    if nextitem is None or nextitem.path != item.path or resident_mb() > LARGE_MB:
+    if nextitem is None or nextitem.path != item.path:
         drop_compiled_programs()
     before, peak = item.config.stash.get(PEAK, 0), peak_mb()
     item.config.stash[PEAK] = peak
@@ -55,15 +55,6 @@ def drop_compiled_programs() -> None:
     gc.collect()
     if sys.platform == "linux":  # glibc keeps what was freed until it is told
         getattr(ctypes.CDLL(None), "malloc_trim", lambda _: 0)(0)
-
-
-def resident_mb() -> int:
-    """Return the resident memory of this process, MB; its peak where there is no /proc."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except OSError:
-        return peak_mb()
-    return pages * resource.getpagesize() // 2**20
 
 
 def peak_mb() -> int:

@@ -276,6 +276,11 @@ CASES: dict[str, Callable[[], Case]] = {
         export_glb(trimesh.Scene(trimesh.creation.box((0.06, 0.15, 0.07)))),
         said="too low: 60 x 150 x 70 mm, up is z (by its .glb format, y); allowed heights",
     ),
+    "glb y up and wide": lambda: Case(
+        "m.glb",
+        export_glb(trimesh.Scene(trimesh.creation.box((0.06, 0.22, 0.12)))),
+        said="too wide: 60 x 220 x 120 mm, up is z (by its .glb format, y); allowed is a width",
+    ),
     "gltf": lambda: Case("m.gltf", with_uri("a b.bin")[0], SIZE, MASS, "it is y", {"a b.bin": with_uri("")[1]}),
     "gltf embedded": lambda: Case(
         "m.gltf",

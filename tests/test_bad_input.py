@@ -206,7 +206,7 @@ MESHES = {
     "kilometres": "set scale: 1000 if the file is in kilometres",
     "low": "m.stl: too low: 60 x 60 x 90 mm, up is z; allowed heights are 0.11 to 0.3 m",
     "tall": "m.stl: too tall: 80 x 80 x 310 mm",
-    "wide": "m.stl: too wide: 210 x 50 x 150 mm; allowed is a width up to 0.2 m",
+    "wide": "m.stl: too wide: 210 x 50 x 150 mm, up is z; allowed is a width up to 0.2 m",
     "slanted": "m.stl: does not stand: tips over at",
     "nan": "vertices are NaN or infinite; allowed are finite",
     "empty": "m.ply: empty file; allowed is a triangle mesh",

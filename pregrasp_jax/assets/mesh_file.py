@@ -72,10 +72,10 @@ def _check_size(vertices: np.ndarray, settings: ObjectSettings, up_hint: str) ->
         raise ValueError(f"wrong unit: {text}, allowed are 0.01 to 1 m; set {hint} in {SETTINGS_FILE}")
     if size.min() < MIN_OBJECT_WIDTH:
         raise ValueError(f"flat: {text}; allowed is at least {MIN_OBJECT_WIDTH * 1e3:g} mm in every direction")
+    up = f"{settings.up or 'z'}{up_hint}"
     if not MIN_OBJECT_HEIGHT <= size[2] <= MAX_OBJECT_HEIGHT:
         what = "too low" if size[2] < MIN_OBJECT_HEIGHT else "too tall"
         allowed = f"allowed heights are {MIN_OBJECT_HEIGHT:g} to {MAX_OBJECT_HEIGHT:g} m"
-        up = f"{settings.up or 'z'}{up_hint}"
         raise ValueError(f"{what}: {text}, up is {up}; {allowed}, scale and up can be set in {SETTINGS_FILE}")
     if size[:2].max() > MAX_OBJECT_WIDTH:
-        raise ValueError(f"too wide: {text}; allowed is a width up to {MAX_OBJECT_WIDTH:g} m")
+        raise ValueError(f"too wide: {text}, up is {up}; allowed is a width up to {MAX_OBJECT_WIDTH:g} m")
