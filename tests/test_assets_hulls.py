@@ -169,12 +169,17 @@ def test_the_search_that_stops_early_finds_the_maximum():
         points = rng.normal(size=(8, 2)) * rng.uniform(0.02, 0.08, 2)
         outline = points[ConvexHull(points).vertices]
         sides = ConvexHull(points).equations
-        cells, _ = rectangle(0.4, 0.4, 2e-3)
+        low, high = outline.min(axis=0), outline.max(axis=0)
+        axes = [np.linspace(low[i], high[i], 193)[:-1] + (high[i] - low[i]) / 384 for i in range(2)]  # as objects have
+        cells = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
         shapes.append((cells[(cells @ sides[:, :2].T + sides[:, 2] <= 0).all(axis=1)], outline))
     yaws = np.arange(144) * (2 * np.pi / 144)
     found = []
     for cells, outline in shapes:
-        largest = float(closing_region._coverage_at(yaws, cells, outline, REGION).max())
+        every = closing_region._coverage_at(yaws, cells, outline, REGION)
+        some = closing_region._coverage_at(yaws, cells[:: closing_region._SAMPLE], outline, REGION)
+        assert np.abs(every - some).max() < closing_region._SAMPLE_ERROR, "by which yaws are left out"
+        largest = float(every.max())
         assert best_coverage(cells, outline, REGION) == largest
         enough = best_coverage(cells, outline, REGION, enough=0.97)
         assert (enough > 0.97) == (largest > 0.97) and enough <= largest

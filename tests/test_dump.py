@@ -198,7 +198,7 @@ def test_a_file_of_numbers_only(dumps):
     """Readable without this package, and nothing in it is pickled."""
     with np.load(dumps["flung"], allow_pickle=False) as file:
         about, qvel = json.loads(str(file["about"])), file["qvel"]
-        assert about["format"] == "pregrasp_jax dump 1" and qvel.max() == FLUNG
+        assert about["format"] == "pregrasp_jax dump 2" and qvel.max() == FLUNG
         assert file["state/physics_obs/object_poses"].shape == (MAX_OBJECTS, 7)
     assert dumps["flung"].stat().st_size < 20_000
 

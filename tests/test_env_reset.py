@@ -150,7 +150,7 @@ def test_walls_in_the_way_are_refused(wall, said):
 def test_objects_that_no_hand_can_take_are_refused():
     bank = builtin_bank("seen")
     wide = [i for i, why in enumerate(ROBOT.eligibility(bank).reasons) if why]
-    with pytest.raises(ValueError, match=rf"none of {len(wide)} objects .* robot ur5e_rg2; .* narrowest"):
+    with pytest.raises(ValueError, match=rf"none of {len(wide)} objects .* robot ur5e_rg2; .* best coverage"):
         env_module.eligible_targets(ROBOT, select(bank, wide))
 
 

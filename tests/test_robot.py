@@ -254,7 +254,7 @@ def test_distance_to_walls_is_mujocos():
     workspace = walled(
         Box(center=(0.5, 0.3, 0.3), half_size=(0.02, 0.6, 0.3), yaw=0.7),
         Box(center=(-0.2, -0.6, 0.2), half_size=(0.5, 0.03, 0.2), yaw=-0.2),
-        Box(center=(-0.5, 0.6, 0.6), half_size=(0.1, 0.1, 0.05), yaw=2.0),
+        Box(center=(-0.5, 0.4, 0.5), half_size=(0.2, 0.2, 0.1), yaw=2.0),
     )
     mj_model = compile_spec(scene_spec(ROBOT, workspace))
     data = mujoco.MjData(mj_model)
