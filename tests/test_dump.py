@@ -15,7 +15,7 @@ from PIL import Image
 from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.cli.replay import Replay, make_replay, make_replay_env
+from pregrasp_jax.cli.replay import RepeatedPush, make_replay, make_replay_env
 from pregrasp_jax.config import Config, ExplorationConfig
 from pregrasp_jax.robot.ur5e_rg2 import FINGER_OPEN
 from pregrasp_jax.scene.bank import SceneBank
@@ -123,7 +123,7 @@ def test_a_dump_repeats_the_push_bit_for_bit(env, dumps, replay, what):
     dump = load_dump(dumps[what])
     assert dump.path.name == "step-000002-scene-1.npz"
     assert dump.engine == "native" and dump.config == config() and dump.hull_bank_hash == env.bank.content_hash
-    again: Replay = replay(dump.mishap(make_replay_env(dump, "native")))
+    again: RepeatedPush = replay(dump.mishap(make_replay_env(dump, "native")))
     assert again.identical and again.duration > 0.3
     assert again.result.outcome.diverged and REASONS[int(again.result.reason)] == "nan"
     if what == "flung":

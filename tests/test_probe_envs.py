@@ -101,7 +101,7 @@ def train(memory, params, key, *, num_updates, batch_size=16, priority_exponent=
     config = LearnerConfig(batch_size=batch_size, discount=GAMMA, polyak=polyak, huber_delta=10.0)
 
     def one(carry, k):
-        state, memory, metrics = learner.learn(
+        state, memory, metrics = learner.sample_and_update(
             carry[0],
             carry[1],
             k,

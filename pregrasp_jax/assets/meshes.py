@@ -34,7 +34,7 @@ from pregrasp_jax.assets.settings import (
 from pregrasp_jax.assets.workers import WorkerPool
 from pregrasp_jax.types import HullBank
 
-Progress = Callable[[int, int, str], object]
+LoadingProgress = Callable[[int, int, str], object]
 """Called as (done, total, file name) in the calling process."""
 
 MIN_TIP_ANGLE = 0.05
@@ -110,7 +110,7 @@ class _Loaded(NamedTuple):
     notes: tuple[str, ...]
 
 
-def load_object_dir(object_dir: Path, object_set: str, *, progress: Progress | None = None) -> LoadedDir:
+def load_object_dir(object_dir: Path, object_set: str, *, progress: LoadingProgress | None = None) -> LoadedDir:
     """Load every mesh of a folder as convex hulls, in the order of the file names.
 
     Args:

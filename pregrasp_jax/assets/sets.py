@@ -8,14 +8,16 @@ import numpy as np
 
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.fit import Fit
-from pregrasp_jax.assets.meshes import LoadedDir, Progress, load_object_dir
+from pregrasp_jax.assets.meshes import LoadedDir, LoadingProgress, load_object_dir
 from pregrasp_jax.types import HullBank
 
 MIN_OBJECTS = 5
 """The smallest scene has five objects, all different."""
 
 
-def load_bank_for(object_dir: str | Path | None, object_set: str, *, progress: Progress | None = None) -> HullBank:
+def load_bank_for(
+    object_dir: str | Path | None, object_set: str, *, progress: LoadingProgress | None = None
+) -> HullBank:
     """Return the built-in objects, or those of a folder; refused meshes are warnings.
 
     Args:

@@ -34,7 +34,7 @@ _ALLOWED = f"pretrained, a run folder, or a folder with the {_PARAMS} that it wr
 
 
 @dataclass(frozen=True)
-class Policy:
+class TrainedPolicy:
     """A trained network.
 
     Attributes:
@@ -60,7 +60,7 @@ def save_policy(folder: Path, params: Any, config: Config, evaluation: dict[str,
     io.write_json(folder / "evaluation.json", evaluation)
 
 
-def load_policy(path: Path | str) -> Policy:
+def load_policy(path: Path | str) -> TrainedPolicy:
     """Read a policy from a run folder (its best policy, else its latest checkpoint), a policy folder, or a file.
 
     The name `pretrained` is that of the policy that ships with the package.
@@ -81,7 +81,7 @@ def load_policy(path: Path | str) -> Policy:
     raise ValueError(f"policy {path} {problem}; allowed: {_ALLOWED}")
 
 
-def _read_policy(path: Path) -> Policy:
+def _read_policy(path: Path) -> TrainedPolicy:
     data = path.read_bytes()
     arrays, metadata = trees.decode(data, origin=str(path)), trees.read_metadata(data)
     if not {"format", "config", "evaluation", "checksum"} <= metadata.keys():
@@ -94,7 +94,7 @@ def _read_policy(path: Path) -> Policy:
         config, evaluation = from_dict(json.loads(metadata["config"])).validate(), json.loads(metadata["evaluation"])
     except ValueError as error:
         raise ValueError(f"{path} was written by another version of this package: {error}") from None
-    return Policy(trees.nest(arrays), config, evaluation, path)
+    return TrainedPolicy(trees.nest(arrays), config, evaluation, path)
 
 
 def _checksum(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
@@ -105,6 +105,6 @@ def _checksum(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> 
     return io.content_hash(params, metadata["config"], metadata["evaluation"])
 
 
-def _policy_of_checkpoint(folder: Path, config: Config) -> Policy:
+def _policy_of_checkpoint(folder: Path, config: Config) -> TrainedPolicy:
     params, origin = read_newest_policy(folder)
-    return Policy(trees.nest(params), config, {}, origin)
+    return TrainedPolicy(trees.nest(params), config, {}, origin)

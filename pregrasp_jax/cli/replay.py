@@ -24,7 +24,7 @@ from pregrasp_jax.types import CTRL_DT, REASONS, EnvState, StepResult
 
 
 @dataclass(frozen=True)
-class Replay:
+class RepeatedPush:
     """What a push did when it was repeated.
 
     Attributes:
@@ -92,21 +92,21 @@ def make_replay_env(dump: Dump, engine: str, object_dir: str | None = None) -> E
     return assemble(config, bank, _one_scene(dump))
 
 
-def make_replay(env: Env) -> Callable[[Mishap], Replay]:
+def make_replay(env: Env) -> Callable[[Mishap], RepeatedPush]:
     """Return the function that repeats a push; it compiles once.
 
     The push is run twice by the same program: as a whole, which is what is judged, and row by row to watch it.
     """
     look, plan, run, conclude = (in_batch(f) for f in (env.look, env.plan, env.engine.run, env.conclude))
 
-    def replay(mishap: Mishap) -> Replay:
+    def replay(mishap: Mishap) -> RepeatedPush:
         before = look(mishap.state, mishap.hand)
         planned = plan(before, mishap.action)
         num_ctrl = planned.num_ctrl
         physics = run(before.physics, planned.ctrl, num_ctrl)
         after, result = conclude(before, planned, physics)
         pairs = zip(jax.tree.leaves(after.physics_obs), jax.tree.leaves(mishap.seen), strict=True)
-        return Replay(
+        return RepeatedPush(
             before=before,
             after=after,
             result=result,
@@ -118,7 +118,7 @@ def make_replay(env: Env) -> Callable[[Mishap], Replay]:
     return replay
 
 
-def describe_replay(env: Env, dump: Dump, mishap: Mishap, replay: Replay) -> list[str]:
+def describe_replay(env: Env, dump: Dump, mishap: Mishap, replay: RepeatedPush) -> list[str]:
     """Return what was pushed, how it ended, and whether it did so in the training."""
     kind = f"branch {int(mishap.branch)}" if mishap.branch else "the real one"
     ended = "diverged" if replay.result.outcome.diverged else "did not diverge"
@@ -134,7 +134,7 @@ def describe_replay(env: Env, dump: Dump, mishap: Mishap, replay: Replay) -> lis
     return [f"{name:<9} {text}" for name, text in lines.items()]
 
 
-def draw_replay(env: Env, mishap: Mishap, replay: Replay) -> np.ndarray:
+def draw_replay(env: Env, mishap: Mishap, replay: RepeatedPush) -> np.ndarray:
     """Return scene | height | segmentation | push before, and the scene afterwards if it is finite."""
     target, before = int(mishap.state.scene.target), replay.before
     tiles = drawing.make_tiles(
@@ -154,7 +154,7 @@ def draw_replay(env: Env, mishap: Mishap, replay: Replay) -> np.ndarray:
 
 
 def _watch(env: Env, run: Callable[..., Any], physics: Any, plan: Plan, num_ctrl: int) -> np.ndarray:
-    """Run one row after the other; see `Replay.speeds`.
+    """Run one row after the other; see `RepeatedPush.speeds`.
 
     The `native` engine wakes what sleeps whenever it is called, so the last digits are not those of the whole push.
     """
@@ -167,7 +167,7 @@ def _watch(env: Env, run: Callable[..., Any], physics: Any, plan: Plan, num_ctrl
     return np.array(speeds)
 
 
-def _describe_moves(env: Env, replay: Replay) -> str:
+def _describe_moves(env: Env, replay: RepeatedPush) -> str:
     before, after = (np.asarray(s.physics_obs.object_poses)[:, :3] for s in (replay.before, replay.after))
     moves = np.linalg.norm(after - before, axis=1)
     ids = np.asarray(replay.before.scene.object_ids)
@@ -175,7 +175,7 @@ def _describe_moves(env: Env, replay: Replay) -> str:
     return ", ".join(text)
 
 
-def _describe_speeds(replay: Replay) -> str:
+def _describe_speeds(replay: RepeatedPush) -> str:
     if not len(replay.speeds):
         return "no motion"
     finite = np.where(np.isfinite(replay.speeds), replay.speeds, np.inf)
@@ -183,7 +183,7 @@ def _describe_speeds(replay: Replay) -> str:
     return f"at most {finite.max():.3g} m/s or rad/s, after {when:.2f} s; watched for {end:.2f} s"
 
 
-def _describe_difference(env: Env, dump: Dump, mishap: Mishap, replay: Replay) -> str:
+def _describe_difference(env: Env, dump: Dump, mishap: Mishap, replay: RepeatedPush) -> str:
     if env.engine.name != dump.engine:
         return f"not comparable: on {env.engine.name}, from rounded coordinates"
     if replay.identical:

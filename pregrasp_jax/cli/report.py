@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from pregrasp_jax.checkpoint import Policy, checksum, load_policy
+from pregrasp_jax.checkpoint import TrainedPolicy, checksum, load_policy
 from pregrasp_jax.checkpoint.state import exists
 from pregrasp_jax.cli.outputs import refuse_unwritable
 from pregrasp_jax.config import AssetsConfig, EvaluationConfig
@@ -96,7 +96,7 @@ def write_page(
     films: Sequence[Film] = (),
     note: str = "",
     *,
-    policy: Policy | None = None,
+    policy: TrainedPolicy | None = None,
     evaluations: Sequence[Path] = (),
     html: Path | None = None,
 ) -> Path:
@@ -129,7 +129,7 @@ def write_page(
     )
 
 
-def find_policy(run: RunRecord) -> Policy:
+def find_policy(run: RunRecord) -> TrainedPolicy:
     """Return the policy of a run.
 
     Raises:

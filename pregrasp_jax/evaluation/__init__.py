@@ -8,13 +8,13 @@ from pregrasp_jax.evaluation.results import (
     format_evaluations,
     load_evaluation,
 )
-from pregrasp_jax.evaluation.runner import Evaluator, Progress, evaluate_policy
+from pregrasp_jax.evaluation.runner import EpisodeCallback, Evaluator, evaluate_policy
 
 __all__ = [
     "Episode",
+    "EpisodeCallback",
     "EvaluationResult",
     "Evaluator",
-    "Progress",
     "evaluate_policy",
     "evaluation_document",
     "format_evaluation",

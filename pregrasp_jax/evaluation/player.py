@@ -12,7 +12,7 @@ import jax
 
 from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.config import Config, EvaluationConfig, TaskOverrides, with_absolute_paths
-from pregrasp_jax.evaluation import Evaluator, Progress, evaluation_document
+from pregrasp_jax.evaluation import EpisodeCallback, Evaluator, evaluation_document
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.machine import announced_compilation
 from pregrasp_jax.policies import scripts
@@ -91,7 +91,7 @@ def run_evaluation(
     request: EvaluationConfig,
     player: Player,
     *,
-    progress: Progress | None = None,
+    progress: EpisodeCallback | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Run the episodes and return the evaluation document (see `evaluation.evaluation_document`).

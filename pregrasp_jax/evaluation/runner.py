@@ -22,7 +22,7 @@ from pregrasp_jax.task.rules import RUNNING
 from pregrasp_jax.task.stages import Stages, make_stages
 from pregrasp_jax.types import REASONS, EnvState, GraspResult
 
-Progress = Callable[[int, int, int], None]
+EpisodeCallback = Callable[[int, int, int], None]
 """(episodes ended, episodes in all, successes so far) -> None."""
 
 MIN_BATCH = 2
@@ -110,7 +110,7 @@ class Evaluator:
         episodes: int,
         seed: int = 0,
         with_grasp: bool = True,
-        progress: Progress | None = None,
+        progress: EpisodeCallback | None = None,
     ) -> EvaluationResult:
         """Run scenes 0 to `episodes` - 1 to their ends.
 
@@ -267,7 +267,7 @@ def evaluate_policy(
     seed: int = 0,
     with_grasp: bool = True,
     num_envs: int = 16,
-    progress: Progress | None = None,
+    progress: EpisodeCallback | None = None,
 ) -> EvaluationResult:
     """Run one policy once; see `Evaluator.run`. Keep an `Evaluator` to run several without compiling again."""
     return Evaluator(env, num_envs=num_envs).run(

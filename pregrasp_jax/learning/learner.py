@@ -137,7 +137,7 @@ def update(
     return next_state, errors, _metrics(batch, loss, errors, targets, grads, successes)
 
 
-def learn(
+def sample_and_update(
     state: LearnerState,
     replay: Replay,
     key: jax.Array,

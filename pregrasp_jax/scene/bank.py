@@ -20,7 +20,7 @@ from pregrasp_jax.types import MAX_OBJECTS, HullBank
 
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
-Progress = Callable[[int, int], None]
+PackingProgress = Callable[[int, int], None]
 """Called with scenes done and scenes wanted."""
 
 VERSION = 1
@@ -79,7 +79,7 @@ def load_or_build(
     split: Split,
     *,
     threads: int = 0,
-    progress: Progress | None = None,
+    progress: PackingProgress | None = None,
 ) -> SceneBank:
     """Return the split's scenes from the cache, or pack them and store them there; a damaged file is a warning.
 
@@ -141,7 +141,7 @@ def build(
     split: Split,
     *,
     threads: int = 0,
-    progress: Progress | None = None,
+    progress: PackingProgress | None = None,
 ) -> SceneBank:
     """Pack scenes until the split is full; see `load_or_build`."""
     wanted = num_scenes(config, split)

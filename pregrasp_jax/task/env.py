@@ -174,7 +174,7 @@ class Env:
 
 
 def make_env(
-    config: Config, *, split: Split, threads: int | None = None, progress: scene_bank.Progress | None = None
+    config: Config, *, split: Split, threads: int | None = None, progress: scene_bank.PackingProgress | None = None
 ) -> Env:
     """Load the objects, load or pack the scenes of a split, and compile an engine of this environment's own.
 

@@ -97,11 +97,11 @@ def make_remember(config: ReplayConfig, rules: Rules) -> RememberFn:
 
 
 def make_update(**options: Any) -> UpdateFn:
-    """Return the function that updates once; `options` are the keyword arguments of `learner.learn` but beta."""
+    """Return the function that updates once; `options` go to `learner.sample_and_update`."""
 
     def update(state: Learning, beta: jax.Array) -> Learning:
         key, sample_key = jax.random.split(state.key)
-        learner_state, replay, metrics = learner.learn(
+        learner_state, replay, metrics = learner.sample_and_update(
             state.learner, state.replay, sample_key, importance_exponent=beta, **options
         )
         metrics = _accumulate(state.metrics, metrics, state.updates)
