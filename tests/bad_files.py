@@ -125,7 +125,7 @@ def make_bad_dumps(folder: Path) -> None:
         arrays = dict(file)
     about = json.loads(str(arrays.pop("about")))
     for name, change in {
-        "newer": {"format": "pregrasp_jax dump 2"},
+        "newer": {"format": "pregrasp_jax dump 3"},
         "typo": {"config": {"sead": 1}},
         "bullet": {"engine": "bullet", "hull_bank_hash": builtin.bank.content_hash},
     }.items():

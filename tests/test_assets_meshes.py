@@ -121,7 +121,7 @@ def test_cache_is_used_and_depends_on_content_settings_and_health(tmp_path, cach
     first = load_object_dir(folder, "seen")
     (entry,) = cache.iterdir()
     with monkeypatch.context() as patch:
-        patch.setattr(meshes, "ProcessPoolExecutor", None)  # a second decomposition would fail
+        patch.setattr(meshes, "WorkerPool", None)  # a second decomposition would fail
         again = load_object_dir(folder, "seen")
     assert again.bank.content_hash == first.bank.content_hash
     assert again.fits["one"].as_numbers() == first.fits["one"].as_numbers()

@@ -220,8 +220,8 @@ MESHES = {
     "outside": "../outside.stl: listed in objects.yaml but leads out of the folder",
     "missing": "gone.stl: listed in objects.yaml but missing; allowed are names of files",
     "many_bytes": "m.stl: file of 257 MB; allowed are 256 MB, decimate it first",
-    "no_target": "{f}: 5 usable 'seen' objects of which 0 can be targets; allowed are at least 5 objects and 1 target",
-    "few": "{f}: 2 usable 'seen' objects of which 2 can be targets; allowed are at least 5 objects and 1 target",
+    "no_target": "{f}: none of 5 objects can be a target for robot ur5e_rg2; allowed is at least 1",
+    "few": "{f}: 2 usable 'seen' objects; allowed are at least 5",
     "setting": "{f}/objects.yaml: m.stl: unknown setting 'colour'; allowed are scale, up, mass, density, friction",
 }
 TRAIN_ON = "train ci --run-dir {w}/new --assets.object-dir "

@@ -45,7 +45,14 @@ def empty_ring(written: int) -> Ring:
 
 
 def save(folder: Path, step: int, written: int) -> Path:
-    return state.save(folder, step, make_tree(step), empty_ring(written), {"seconds": step / 3}, policy="params/")
+    return state.save(
+        folder,
+        step,
+        make_tree(step),
+        empty_ring(written),
+        {"seconds": step / 3},
+        policy="learning/learner/target_params/",
+    )
 
 
 def restore(folder: Path) -> state.Restored:
@@ -189,7 +196,7 @@ def test_a_lost_chunk_that_all_checkpoints_share_costs_its_observations_and_no_c
     np.testing.assert_array_equal(again.lost, restored.lost)
     for step, written in ((4, 12), (5, 13), (6, 13)):
         ring = Ring({name: jnp.asarray(leaf) for name, leaf in restored.ring.items()}, written)
-        state.save(tmp_path, step, make_tree(step), ring, {}, policy="params/")
+        state.save(tmp_path, step, make_tree(step), ring, {}, policy="learning/learner/target_params/")
     final = restore(tmp_path)
     assert final.step == 6 and final.problems == () and not final.lost.any()
 

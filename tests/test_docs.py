@@ -22,8 +22,8 @@ def test_the_python_of_the_readme_runs(monkeypatch, capsys):
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     pack = scene_bank.load_or_build
 
-    def pack_few(bank, config, split, **options):
-        return pack(bank, dataclasses.replace(config, test_scenes=4), split, **options)
+    def pack_few(bank, eligible, config, split, **options):
+        return pack(bank, eligible, dataclasses.replace(config, test_scenes=4), split, **options)
 
     monkeypatch.setattr(scene_bank, "load_or_build", pack_few)
     exec(compile(code, "README.md", "exec"), {})

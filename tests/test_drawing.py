@@ -146,7 +146,8 @@ def test_contact_sheet_shows_the_tallest_object_whole():
         for part in (tall, low)
     ]
     differs = (pictures[0] != pictures[1]).any(axis=2)
-    assert differs[60:].any() and not differs[:3].any() and not differs[:, :3].any() and not differs[:, -3:].any()
+    assert differs[60:].any() and not differs[:3].any() and not differs[:, :3].any()
+    assert not differs[:100, -3:].any(), "below, its shadow leaves the picture"
 
 
 def test_files_hold_what_was_drawn(tmp_path):

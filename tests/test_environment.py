@@ -128,7 +128,7 @@ def test_no_programs_are_kept_where_nothing_can_be_written(tmp_path, monkeypatch
 
 LOAD = """
 from pregrasp_jax.assets.meshes import load_object_dir
-bank, _ = load_object_dir({folder!r}, "seen")
+bank = load_object_dir({folder!r}, "seen").bank
 print(bank.names)
 """
 

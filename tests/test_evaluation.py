@@ -269,5 +269,5 @@ def test_load_refuses_foreign_files(tmp_path: Path, content: str | None) -> None
     path = tmp_path / "e.json"
     if content is not None:
         path.write_text(content)
-    with pytest.raises(ValueError, match=r"e\.json: .*evaluate\.py --json"):
+    with pytest.raises(ValueError, match=r"e\.json: .*pregrasp-jax evaluate --json"):
         results.load_evaluation(path)

@@ -79,7 +79,7 @@ def test_files_of_a_release_are_where_they_belong(built: Built):
     everywhere |= {f"pregrasp_jax/pretrained/{path.name}" for path in (ROOT / "pregrasp_jax" / "pretrained").iterdir()}
     assert everywhere <= wheel and everywhere <= sdist
     assert f"pregrasp_jax-{pregrasp_jax.__version__}.dist-info/licenses/LICENSE" in wheel
-    assert "pregrasp_jax/mjcf/scene.xml" in wheel and "mjcf/scene.xml" in sdist
+    assert "pregrasp_jax/mjcf/table.xml" in wheel and "mjcf/table.xml" in sdist
     assert {"LICENSE", "CITATION.cff", "constraints.txt", "train.py", "tests/conftest.py", "docs/task.md"} <= sdist
     assert not [name for name in wheel if name.startswith(("tests", "benchmarks", "docs", "train", "evaluate"))]
     assert not [name for name in wheel | sdist if "__pycache__" in name]

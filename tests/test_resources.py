@@ -13,7 +13,7 @@ from pregrasp_jax.training import resources
 
 def test_what_a_run_needs_is_estimated(tmp_path, monkeypatch):
     rest, ring = make_program(make_config()).shapes().split()
-    assert resources.num_bytes(ring) == 70 * (2 * 100 * 100 + 2 * 4)
+    assert resources.num_bytes(ring) == 70 * (2 * 100 * 100 + 5 * 4)
     resources.check(rest, ring, tmp_path / "new" / "run")
     assert not (tmp_path / "new").exists()
     monkeypatch.setattr(resources, "available_memory", lambda: 10**6)

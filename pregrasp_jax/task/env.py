@@ -192,7 +192,7 @@ def make_env(
     refuse_walls(get_robot(config.task.robot), get_workspace(config.task.workspace))
     registry.get_kind(config.task.primitive)  # before anything is packed
     bank = load_bank_for(config.assets.object_dir, config.assets.object_set)
-    eligible = eligible_targets(get_robot(config.task.robot), bank)
+    eligible = eligible_targets(get_robot(config.task.robot), bank, origin=str(config.assets.object_dir or "built in"))
     scenes = scene_bank.load_or_build(bank, eligible, config.scene, split, threads=threads, progress=progress)
     return assemble(config, bank, scenes, threads=threads)
 
@@ -207,8 +207,13 @@ def assemble(config: Config, bank: HullBank, scenes: SceneBank, *, threads: int 
     return Env(config.task, workspace, robot, *parts, bank, eligible, scenes, engine, reach)
 
 
-def eligible_targets(robot: Robot, bank: HullBank) -> np.ndarray:
+def eligible_targets(robot: Robot, bank: HullBank, *, origin: str = "hull bank") -> np.ndarray:
     """Return which objects [N] bool a robot's hand can take.
+
+    Args:
+        robot: whose hand.
+        bank: the objects.
+        origin: where they come from, for the error.
 
     Raises:
         ValueError: none; the line says why the first one cannot be taken.
@@ -216,8 +221,8 @@ def eligible_targets(robot: Robot, bank: HullBank) -> np.ndarray:
     eligible, reasons = robot.eligibility(bank)
     if not eligible.any():
         raise ValueError(
-            f"none of {len(bank.names)} objects can be a target for robot {robot.name}; allowed is at least 1. The "
-            f"first: {bank.names[0]}: {reasons[0]}"
+            f"{origin}: none of {len(bank.names)} objects can be a target for robot {robot.name}; allowed is at least "
+            f"1. The first: {bank.names[0]}: {reasons[0]}"
         )
     return eligible
 
