@@ -12,6 +12,7 @@ import pytest
 from pregrasp_jax.checkpoint import chunks, policy, read_config, state, trees, write_config
 from pregrasp_jax.checkpoint.chunks import Ring
 from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.training.program import POLICY
 
 CAPACITY = 10
 
@@ -51,7 +52,7 @@ def save(folder: Path, step: int, written: int) -> Path:
         make_tree(step),
         empty_ring(written),
         {"seconds": step / 3},
-        policy="learning/learner/target_params/",
+        policy=POLICY,
     )
 
 
@@ -196,7 +197,7 @@ def test_a_lost_chunk_that_all_checkpoints_share_costs_its_observations_and_no_c
     np.testing.assert_array_equal(again.lost, restored.lost)
     for step, written in ((4, 12), (5, 13), (6, 13)):
         ring = Ring({name: jnp.asarray(leaf) for name, leaf in restored.ring.items()}, written)
-        state.save(tmp_path, step, make_tree(step), ring, {}, policy="learning/learner/target_params/")
+        state.save(tmp_path, step, make_tree(step), ring, {}, policy=POLICY)
     final = restore(tmp_path)
     assert final.step == 6 and final.problems == () and not final.lost.any()
 
