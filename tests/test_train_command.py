@@ -54,8 +54,12 @@ def test_a_box_becomes_one_line(frame):
 LISTENER = """
 import hashlib, os, sys, time
 from pregrasp_jax.training.interrupt import Interrupt
-with Interrupt(lambda line: print(line, flush=True), lambda: print("cursor back", flush=True)) as interrupt:
-    print("ready", flush=True)
+
+def say(line):
+    print(line + "\\n", end="", flush=True)  # in one piece: the signal is answered in a thread of its own
+
+with Interrupt(say, lambda: say("cursor back")) as interrupt:
+    say("ready")
     if sys.argv[1] == "busy":
         # One bytecode of a minute that gives the GIL away, as a compilation does: Python-level handlers have to wait.
         hashlib.pbkdf2_hmac("sha256", b"", b"", 10**8)
@@ -63,7 +67,7 @@ with Interrupt(lambda line: print(line, flush=True), lambda: print("cursor back"
         time.sleep(0.01)
     if sys.argv[1] == "deaf":
         os._exit(interrupt.exit_code)
-    print("stopped by the loop", flush=True)
+    say("stopped by the loop")
     sys.exit(interrupt.exit_code)
 """
 
