@@ -10,6 +10,8 @@ from typing import Any
 
 import yaml
 
+from pregrasp_jax.messages import one_line
+
 _CORE_SCHEMA = {
     "null": (r"~|null|Null|NULL|", "~nN"),
     "bool": (r"true|True|TRUE|false|False|FALSE", "tTfF"),
@@ -32,15 +34,15 @@ def read(path: Path) -> Any:
         return yaml.load(path.read_bytes(), _Loader)
     except yaml.MarkedYAMLError as error:
         said = ", ".join(filter(None, (error.context, error.problem)))
-        raise ValueError(f"{path}: {_place(error)}{_one_line(said)}") from None
+        raise ValueError(f"{path}: {_place(error)}{one_line(said)}") from None
     except yaml.YAMLError as error:
-        raise ValueError(f"{path}: not valid YAML: {_one_line(error)}") from None
+        raise ValueError(f"{path}: not valid YAML: {one_line(error)}") from None
     except RecursionError:
         raise ValueError(f"{path}: nested too deeply; allowed are mappings of settings") from None
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, KeyError) as error:  # of a number with thousands of digits, of `!!bool maybe`
-        raise ValueError(f"{path}: holds a value that cannot be read ({_one_line(error)})") from None
+        raise ValueError(f"{path}: holds a value that cannot be read ({one_line(error)})") from None
 
 
 def dump(values: Any) -> bytes:
@@ -101,7 +103,3 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_int)
 def _place(error: yaml.MarkedYAMLError) -> str:
     mark = error.problem_mark or error.context_mark
     return f"line {mark.line + 1}: " if mark else ""
-
-
-def _one_line(text: object) -> str:
-    return " ".join(str(text).split())

@@ -9,6 +9,7 @@ import pregrasp_jax
 
 PACKAGE = Path(pregrasp_jax.__file__).parent
 ORDER = [
+    ["messages"],
     ["io", "types", "yaml_file"],
     ["config", "geometry", "machine", "spaces", "startup"],
     ["assets"],

@@ -22,7 +22,7 @@ from pregrasp_jax.assets import decompose
 from pregrasp_jax.assets.bank import FORMAT, ConvexObject, concatenate, load_about, load_bank, make_bank, save_bank
 from pregrasp_jax.assets.fit import Fit, fit_parts
 from pregrasp_jax.assets.folder import find_meshes
-from pregrasp_jax.assets.formats import SUFFIXES, one_line, read_files
+from pregrasp_jax.assets.formats import SUFFIXES, read_files
 from pregrasp_jax.assets.mesh_file import load_mesh
 from pregrasp_jax.assets.settings import (
     SETTINGS_FILE,
@@ -32,6 +32,7 @@ from pregrasp_jax.assets.settings import (
     refuse_beside_sets,
 )
 from pregrasp_jax.assets.workers import WorkerPool
+from pregrasp_jax.messages import one_line
 from pregrasp_jax.types import HullBank
 
 LoadingProgress = Callable[[int, int, str], object]

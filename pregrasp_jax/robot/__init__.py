@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable
 
+from pregrasp_jax import messages
 from pregrasp_jax.robot import ur5e_rg2
 from pregrasp_jax.robot.base import Robot
 
@@ -17,6 +18,4 @@ def get_robot(name: str) -> Robot:
     Raises:
         ValueError: there is none; the line lists those that exist.
     """
-    if name not in ROBOTS:
-        raise ValueError(f"task.robot = {name!r} does not exist; allowed: {', '.join(sorted(ROBOTS))}")
-    return ROBOTS[name]()
+    return messages.lookup(ROBOTS, name, key="task.robot")()

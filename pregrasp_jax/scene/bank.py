@@ -15,6 +15,7 @@ import numpy as np
 
 from pregrasp_jax import io
 from pregrasp_jax.config import SceneConfig
+from pregrasp_jax.messages import one_line
 from pregrasp_jax.scene import packing
 from pregrasp_jax.types import MAX_OBJECTS, HullBank
 
@@ -101,7 +102,7 @@ def load_or_build(
         try:
             return load(path, digest)
         except ValueError as error:
-            warnings.warn(f"{' '.join(str(error).split())}; its scenes are packed anew", stacklevel=2)
+            warnings.warn(f"{one_line(error)}; its scenes are packed anew", stacklevel=2)
     io.refuse_unwritable_cache(path)
     scenes = build(bank, eligible, config, split, threads=threads, progress=progress)
     save(path, scenes)

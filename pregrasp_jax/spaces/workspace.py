@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pregrasp_jax import messages
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.arrays import namespace
 
@@ -92,6 +93,4 @@ def get_workspace(name: str) -> Workspace:
     Raises:
         ValueError: there is none; the line lists those that exist.
     """
-    if name not in WORKSPACES:
-        raise ValueError(f"task.workspace = {name!r} does not exist; allowed: {', '.join(sorted(WORKSPACES))}")
-    return WORKSPACES[name]
+    return messages.lookup(WORKSPACES, name, key="task.workspace")

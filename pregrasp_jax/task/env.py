@@ -194,14 +194,25 @@ def make_env(
     bank = load_bank_for(config.assets.object_dir, config.assets.object_set)
     eligible = eligible_targets(get_robot(config.task.robot), bank, origin=str(config.assets.object_dir or "built in"))
     scenes = scene_bank.load_or_build(bank, eligible, config.scene, split, threads=threads, progress=progress)
-    return assemble(config, bank, scenes, threads=threads)
+    return assemble(config, bank, scenes, eligible=eligible, threads=threads)
 
 
-def assemble(config: Config, bank: HullBank, scenes: SceneBank, *, threads: int = 0) -> Env:
-    """Return the environment of a configuration for objects and scenes at hand; see `make_env`."""
+def assemble(
+    config: Config, bank: HullBank, scenes: SceneBank, *, eligible: np.ndarray | None = None, threads: int = 0
+) -> Env:
+    """Return the environment of a configuration for objects and scenes at hand; see `make_env`.
+
+    Args:
+        config: the run's configuration.
+        bank: the objects.
+        scenes: the packed scenes of one split.
+        eligible: [N] bool, from `eligible_targets`, where that is known.
+        threads: of the native engine; 0 takes every core.
+    """
     robot, workspace = get_robot(config.task.robot), get_workspace(config.task.workspace)
     refuse_walls(robot, workspace)
-    eligible, reach = eligible_targets(robot, bank), longest_push(config)
+    eligible = eligible_targets(robot, bank) if eligible is None else eligible
+    reach = longest_push(config)
     parts = make_task(config.task, robot, workspace, bank, max_distance=reach)
     engine = make_engine(config.physics.engine, bank, robot, workspace, threads=threads)
     return Env(config.task, workspace, robot, *parts, bank, eligible, scenes, engine, reach)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+from pregrasp_jax import messages
 from pregrasp_jax.task import push, rules
 from pregrasp_jax.task.primitive import Primitive
 from pregrasp_jax.task.rules import Rules
@@ -30,6 +31,4 @@ def get_kind(name: str) -> Kind:
     Raises:
         ValueError: there is none; the line lists those that exist.
     """
-    if name not in KINDS:
-        raise ValueError(f"task.primitive = {name!r} does not exist; allowed: {', '.join(sorted(KINDS))}")
-    return KINDS[name]
+    return messages.lookup(KINDS, name, key="task.primitive")

@@ -12,6 +12,7 @@ from pregrasp_jax.assets.formats.gltf import external_buffers, read_gltf
 from pregrasp_jax.assets.formats.ply import read_ply
 from pregrasp_jax.assets.formats.surface import Surface
 from pregrasp_jax.assets.formats.text import decode, read_obj, read_off
+from pregrasp_jax.messages import one_line
 
 MAX_BYTES = 256 * 2**20
 """Largest mesh file; 2 M faces are 100 MB of binary STL."""
@@ -78,11 +79,6 @@ def what_it_is(data: bytes, suffix: str) -> str:
         if data.startswith(magic) and suffix not in suffixes:
             return f"{name}, not a {suffix} file; allowed is a triangle mesh whose name ends as its content is"
     return ""
-
-
-def one_line(error: Exception) -> str:
-    """Return the message of an error on one line."""
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _refuse_large(path: Path) -> None:
