@@ -56,8 +56,10 @@ def projection(bank: HullBank, index: int) -> tuple[np.ndarray, np.ndarray]:
     points, _ = _raster(outline)
     inside = np.zeros(len(points), bool)
     for hull in vertices:
-        sides = ConvexHull(hull[:, :2].astype(np.float64)).equations
-        inside |= (points @ sides[:, :2].T + sides[:, 2] <= 0).all(axis=1)
+        left = np.flatnonzero(~inside)
+        for side in ConvexHull(hull[:, :2].astype(np.float64)).equations:
+            left = left[points[left] @ side[:2] + side[2] <= 0]
+        inside[left] = True
     return points[inside], outline
 
 

@@ -82,7 +82,7 @@ class Evaluator:
         self._env = env
         self._num_envs = max(num_envs, MIN_BATCH)
         self._start = jax.jit(jax.vmap(self._start_one))
-        self._restart = jax.jit(jax.vmap(self._restart_one))
+        self._replace = jax.jit(jax.vmap(_where))
         decide = jax.vmap(self._decide_one, in_axes=(None, 0, None))
         self._push = make_stages(env.engine, decide, jax.vmap(self._conclude_one))
         self._grasp = make_stages(env.engine, jax.vmap(self._plan_grasp_one), jax.vmap(self._conclude_grasp_one))
@@ -95,13 +95,12 @@ class Evaluator:
             policy: the one that will run, or one of the same kind.
             episodes: as many as will run.
         """
-        indices = np.zeros(self._batch_size(episodes), np.int32)
-        runs = jax.eval_shape(self._start, indices)
-        enclosed = jax.eval_shape(self._start, np.zeros(self._num_envs, np.int32))
-        self._program(self._start, indices)
+        num_envs = self._batch_size(episodes)
+        runs = self._program(self._start, np.zeros(num_envs, np.int32)).out_info
+        enclosed = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((self._num_envs, *leaf.shape[1:]), leaf.dtype), runs)
         self._program(self._push, _bound(policy), runs, jax.random.key(0))
-        self._program(self._restart, runs, indices)
-        self._program(self._grasp, enclosed.state)
+        self._program(self._replace, np.zeros(num_envs, bool), runs, runs)
+        self._program(self._grasp, enclosed.state, np.ones(self._num_envs, bool))
 
     def run(
         self,
@@ -184,7 +183,9 @@ class Evaluator:
             following = np.full(num_envs, -1, np.int32)
             following[ended] = [next(waiting, -1) for _ in ended]
             busy[ended] = following[ended] >= 0
-            runs = self._call(self._restart, runs, following)
+            if busy.any():
+                fresh = self._call(self._start, np.maximum(following, 0))
+                runs = self._call(self._replace, following >= 0, fresh, runs)
 
     def _batch_size(self, episodes: int) -> int:
         """Return how many scenes are pushed side by side."""
@@ -203,12 +204,12 @@ class Evaluator:
         return self._program(function, *args)(*args)
 
     def _grasp_all(self, runs: list[_Run]) -> list[Episode]:
-        """Execute the grasp in up to `num_envs` scenes; the batch is filled up with copies of the last."""
+        """Execute the grasp in up to `num_envs` scenes; the batch is filled up with copies of the last, at no cost."""
         if not runs:
             return []
         padded = runs + runs[-1:] * (self._num_envs - len(runs))
         states = jax.tree.map(lambda *leaves: np.stack(leaves), *(run.state for run in padded))
-        grasps = jax.device_get(self._call(self._grasp, states))
+        grasps = jax.device_get(self._call(self._grasp, states, np.arange(self._num_envs) < len(runs)))
         return [self._episode(run, jax.tree.map(lambda leaf, i=i: leaf[i], grasps)) for i, run in enumerate(runs)]
 
     def _episode(self, run: _Run, grasp: GraspResult | None = None) -> Episode:
@@ -233,10 +234,6 @@ class Evaluator:
     def _start_one(self, index: jax.Array) -> _Run:
         return _Run(self._env.reset_to(index), jnp.int32(RUNNING), jnp.float32(0.0), jnp.float32(0.0), jnp.int32(-1))
 
-    def _restart_one(self, run: _Run, index: jax.Array) -> _Run:
-        """Return scene `index` if it is not negative, else `run`."""
-        return _where(index >= 0, self._start_one(jnp.maximum(index, 0)), run)
-
     def _decide_one(self, policy: Policy, run: _Run, key: jax.Array) -> tuple[Any, Plan, Any]:
         """Let the policy decide, and plan; an ended run stays where it is."""
         state = run.state
@@ -251,8 +248,8 @@ class Evaluator:
         pushed = _Run(state, result.reason, run.return_ + result.reward, run.seconds + result.seconds, run.action)
         return _where(run.reason == RUNNING, pushed, run)
 
-    def _plan_grasp_one(self, state: EnvState) -> tuple[Any, Plan, Any]:
-        return state.physics, self._env.plan_grasp(state), state
+    def _plan_grasp_one(self, state: EnvState, execute: jax.Array) -> tuple[Any, Plan, Any]:
+        return state.physics, self._env.plan_grasp(state).unless(~execute, "no_ik"), state
 
     def _conclude_grasp_one(self, state: EnvState, plan: Plan, physics: Any) -> GraspResult:
         del plan

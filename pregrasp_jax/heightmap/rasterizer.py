@@ -46,6 +46,7 @@ class PixelHulls(struct.PyTreeNode):
     present: jax.Array
 
 
+@functools.partial(jax.jit, static_argnames=("shape", "limit", "tile", "chunk"))
 def rasterize(
     hulls: PixelHulls, *, shape: tuple[int, int], limit: float, tile: int = 16, chunk: int = 64
 ) -> tuple[jax.Array, jax.Array]:

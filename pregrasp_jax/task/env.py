@@ -248,7 +248,7 @@ def make_task(
     """
     kind = registry.get_kind(task.primitive)
     primitive = kind.make_primitive(robot, workspace, task, max_distance=max_distance)
-    if not primitive.mask(jax.tree.map(jnp.asarray, robot.start)).any():
+    if not np.any(primitive.mask(jax.tree.map(np.float32, robot.start))):
         x, y = robot.start.xy
         raise ValueError(
             f"task.r_in = {task.r_in} and task.r_out = {task.r_out} leave no cell of the workspace around the start "

@@ -45,8 +45,9 @@ class Stages:
         """
         if self.advance is None:
             return (compile_fn or _compile)(self.__call__, args)
-        before = _compile(self.before, args)
-        physics, plan, kept = jax.eval_shape(self.before, *args)
+        traced = jax.jit(self.before).trace(*args)
+        physics, plan, kept = traced.out_info
+        before = traced.lower().compile()
         after = _compile(self.after, (kept, plan.replace(ctrl=None), physics))
         advance = self.advance
 
