@@ -27,7 +27,7 @@ from pregrasp_jax.types import (
 SEGMENTATION = {"table": 0, "obstacle": 1, "target": 2, "robot": 3}
 """Pixel values of the fused segmentation (Sec. III-B)."""
 
-_MIN_STD = 1e-3
+MIN_STD = 1e-3
 """m; floor of the standard deviation, so that an empty table gives zeros."""
 
 
@@ -143,7 +143,7 @@ def network_input(obs: Observation, target_slot: jax.Array) -> jax.Array:
     """
     assert obs.height.shape == obs.instance_ids.shape and obs.height.ndim == 2, obs.height.shape
     height = grid.dequantize_height(obs.height)
-    normalized = (height - height.mean()) / jnp.maximum(height.std(), _MIN_STD)
+    normalized = (height - height.mean()) / jnp.maximum(height.std(), MIN_STD)
     segmentation = fuse_segmentation(obs.instance_ids, target_slot).astype(jnp.float32)
     return jnp.stack([normalized, segmentation / max(SEGMENTATION.values())], axis=-1)
 
