@@ -76,6 +76,9 @@ class TaskConfig:
     """m/s, mean speed of the minimum-jerk push."""
     camera: CameraName = "orthographic"
     """`orthographic` draws exact heightmaps; `pinhole` sees what a 640 x 480 overhead RGB-D camera sees."""
+    sensor: str = "clean"
+    """What that camera, the masks and the objects get wrong: clean, d435, d455, or a .yaml file (docs/deploy.md). Needs
+    `pinhole`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,6 +238,8 @@ class TaskOverrides:
     """Does what, for scripts: a name in `task.registry.KINDS`."""
     camera: CameraName | None = None
     """What the policy sees through (`orthographic` for scripts)."""
+    sensor: str | None = None
+    """What that camera, the masks and the objects get wrong: clean, d435, d455, or a .yaml file. Needs `pinhole`."""
     r_out: float | None = None
     """m, outer radius of the half ring."""
     obstacles_may_leave: bool = False
@@ -388,11 +393,14 @@ def _checked(value: Any, hint: Any, key: str) -> Any:
 
 
 def with_absolute_paths(config: Config) -> Config:
-    """Return a config whose folders mean the same from any working directory."""
-    folder = config.assets.object_dir
-    if folder is None:
-        return config
-    return dataclasses.replace(config, assets=dataclasses.replace(config.assets, object_dir=os.path.abspath(folder)))
+    """Return a config whose folders and files mean the same from any working directory."""
+    folder, sensor = config.assets.object_dir, config.task.sensor
+    if folder is not None:
+        assets = dataclasses.replace(config.assets, object_dir=os.path.abspath(folder))
+        config = dataclasses.replace(config, assets=assets)
+    if sensor.endswith((".yaml", ".yml")):
+        config = dataclasses.replace(config, task=dataclasses.replace(config.task, sensor=os.path.abspath(sensor)))
+    return config
 
 
 def difference(old: Config, new: Config) -> list[str]:

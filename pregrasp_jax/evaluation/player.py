@@ -173,5 +173,5 @@ def _given(overrides: TaskOverrides) -> dict[str, Any]:
 def _make_script(name: str, env: Env, config: Config) -> Policy:
     """Return a script; `lookahead` gets an engine of its own, and no camera, which it would render for nothing."""
     if name == "lookahead":
-        env = with_task(make_env(config, split="test"), camera="orthographic")
+        env = with_task(make_env(config, split="test"), camera="orthographic", sensor="clean")
     return scripts.SCRIPTS[name](env)

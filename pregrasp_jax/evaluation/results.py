@@ -1,5 +1,6 @@
 """Results of an evaluation: episodes, what follows from them, and the file that two runs are compared by."""
 
+import dataclasses
 import json
 from collections import Counter
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import numpy as np
 from pregrasp_jax import io
 from pregrasp_jax.config import Config, to_dict
 from pregrasp_jax.evaluation.statistics import is_interval, is_number, wilson_interval
+from pregrasp_jax.heightmap import get_sensor
 from pregrasp_jax.machine import versions
 
 FORMAT = "pregrasp_jax evaluation 1"
@@ -132,6 +134,7 @@ def evaluation_document(
         "physics": config.physics.engine,
         "object_set": config.assets.object_set,
         "camera": config.task.camera,
+        "sensor": {"name": config.task.sensor, **dataclasses.asdict(get_sensor(config.task.sensor))},
         "workspace": config.task.workspace,
         "robot": config.task.robot,
         "primitive": config.task.primitive,
@@ -203,7 +206,9 @@ def format_evaluation(document: dict[str, Any]) -> str:
     }
     if document.get("overflows"):
         lines["contacts dropped"] = f"in {document['overflows']} episodes: the limits of the physics engine are too low"
-    settings = f"{document['physics']} physics, {document['camera']} camera, seed {document['seed']}"
+    sensor = document.get("sensor", {}).get("name", "clean")
+    camera = document["camera"] + (" camera" if sensor == "clean" else f" camera, sensor {sensor}")
+    settings = f"{document['physics']} physics, {camera}, seed {document['seed']}"
     rows = [f"  {name:<18}{text}" for name, text in lines.items()]
     return "\n".join([f"{title} ({settings}, {document['wall_seconds']:.0f} s)", *rows])
 

@@ -10,6 +10,7 @@ from pregrasp_jax.heightmap.observation import (
     robot_hulls,
     scene_hulls,
 )
+from pregrasp_jax.heightmap.sensor import SENSORS, Sensor, episode_key, get_sensor, sense
 from pregrasp_jax.heightmap.views import (
     Camera,
     HullInstances,
@@ -21,9 +22,13 @@ from pregrasp_jax.heightmap.views import (
 
 __all__ = [
     "SEGMENTATION",
+    "SENSORS",
     "Camera",
     "HullInstances",
+    "Sensor",
+    "episode_key",
     "fuse_segmentation",
+    "get_sensor",
     "network_input",
     "object_hulls",
     "observe",
@@ -33,5 +38,6 @@ __all__ = [
     "render_pinhole",
     "robot_hulls",
     "scene_hulls",
+    "sense",
     "unproject",
 ]

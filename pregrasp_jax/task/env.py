@@ -6,6 +6,7 @@ its `StepResult` says terminated or truncated.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax import geometry, heightmap, startup
+from pregrasp_jax.assets import variants
 from pregrasp_jax.assets.sets import load_bank_for
 from pregrasp_jax.config import Config, TaskConfig
+from pregrasp_jax.heightmap import SENSORS, Sensor
 from pregrasp_jax.physics import make_engine
 from pregrasp_jax.physics.base import Engine
 from pregrasp_jax.robot import get_robot
@@ -41,6 +44,11 @@ from pregrasp_jax.types import (
     StepResult,
 )
 
+CLEAN = SENSORS["clean"]
+
+_VARIANTS = 1
+"""Tells the key that draws variants of objects from those of images."""
+
 
 @dataclass(frozen=True)
 class Env:
@@ -57,6 +65,8 @@ class Env:
         scenes: the packed scenes of one split.
         engine: physics.
         max_distance: m, longest push that is planned.
+        sensor: what the pinhole camera and the masks get wrong.
+        num_variants: of every object in the bank, which differ in mass and friction; an episode draws among them.
     """
 
     task: TaskConfig
@@ -69,6 +79,8 @@ class Env:
     scenes: SceneBank
     engine: Engine
     max_distance: float
+    sensor: Sensor = CLEAN
+    num_variants: int = 1
 
     def reset(self, key: jax.Array) -> EnvState:
         """Return a random scene of the bank under a random yaw with a random eligible target."""
@@ -156,7 +168,17 @@ class Env:
         """Return scene `index` of the bank turned by `yaw` about the centre."""
         object_ids, poses = jnp.asarray(self.scenes.object_ids)[index], jnp.asarray(self.scenes.poses)[index]
         turned = jax.vmap(functools.partial(_turn, yaw=yaw))(poses)
-        return SceneParams(object_ids, jnp.where((object_ids >= 0)[:, None], turned, poses), target.astype(jnp.int32))
+        target, poses = target.astype(jnp.int32), jnp.where((object_ids >= 0)[:, None], turned, poses)
+        return SceneParams(self._drawn(object_ids, heightmap.episode_key(self.sensor, poses, target)), poses, target)
+
+    def _drawn(self, object_ids: jax.Array, episode: jax.Array) -> jax.Array:
+        """Return object ids [MAX_OBJECTS] with a variant of each object, as the episode draws them."""
+        if self.num_variants == 1:
+            return object_ids
+        key = jax.random.fold_in(episode, _VARIANTS)
+        variant = jax.random.randint(key, object_ids.shape, 0, self.num_variants)
+        num_objects = len(self.bank.names) // self.num_variants
+        return jnp.where(object_ids >= 0, object_ids + num_objects * variant, object_ids)
 
     def look(self, state: EnvState, hand: HandPose | None = None) -> EnvState:
         """Return the state with everything that is seen or measured brought up to date with its physics.
@@ -169,8 +191,22 @@ class Env:
         hulls = heightmap.scene_hulls(self.bank, self.robot, state.scene, physics_obs, self.workspace)
         com = jnp.asarray(self.bank.com)[state.scene.object_ids]
         centroids = jax.vmap(geometry.transform_points)(physics_obs.object_poses, com)
-        obs = heightmap.observe(hulls, state.hand if hand is None else hand, camera=self.task.camera)
+        hand = state.hand if hand is None else hand
+        obs = heightmap.observe(hulls, hand, camera=self.task.camera, look=self._camera(state))
         return state.replace(physics_obs=physics_obs, obs=obs, centroids=centroids)
+
+    def _camera(self, state: EnvState) -> Callable[..., Any]:
+        """Return what the pinhole camera makes of hulls in this state."""
+        if self.sensor == CLEAN:
+            return heightmap.pinhole
+        scene = state.scene
+        return functools.partial(
+            heightmap.sense,
+            self.sensor,
+            episode=heightmap.episode_key(self.sensor, scene.poses, scene.target),
+            num_pushes=state.num_pushes,
+            target=scene.target,
+        )
 
 
 def make_env(
@@ -191,6 +227,7 @@ def make_env(
     threads = config.physics.threads if threads is None else threads
     refuse_walls(get_robot(config.task.robot), get_workspace(config.task.workspace))
     registry.get_kind(config.task.primitive)  # before anything is packed
+    sensor_of(config.task)
     bank = load_bank_for(config.assets.object_dir, config.assets.object_set)
     eligible = eligible_targets(get_robot(config.task.robot), bank, origin=str(config.assets.object_dir or "built in"))
     scenes = scene_bank.load_or_build(bank, eligible, config.scene, split, threads=threads, progress=progress)
@@ -212,10 +249,34 @@ def assemble(
     robot, workspace = get_robot(config.task.robot), get_workspace(config.task.workspace)
     refuse_walls(robot, workspace)
     eligible = eligible_targets(robot, bank) if eligible is None else eligible
-    reach = longest_push(config)
+    reach, sensor, num_variants = longest_push(config), sensor_of(config.task), 1
+    if _spread(sensor) != _spread(CLEAN):
+        mass_spread, friction_spread = _spread(sensor)
+        bank = variants.vary(bank, mass_spread=mass_spread, friction_spread=friction_spread, seed=sensor.seed)
+        num_variants, eligible = variants.NUM_VARIANTS, np.tile(eligible, variants.NUM_VARIANTS)
     parts = make_task(config.task, robot, workspace, bank, max_distance=reach)
     engine = make_engine(config.physics.engine, bank, robot, workspace, threads=threads)
-    return Env(config.task, workspace, robot, *parts, bank, eligible, scenes, engine, reach)
+    return Env(config.task, workspace, robot, *parts, bank, eligible, scenes, engine, reach, sensor, num_variants)
+
+
+def sensor_of(task: TaskConfig) -> Sensor:
+    """Return the sensor of a task.
+
+    Raises:
+        ValueError: there is none of this name, its file cannot be used, or the camera is not the pinhole.
+    """
+    sensor = heightmap.get_sensor(task.sensor)
+    if sensor != CLEAN and task.camera != "pinhole":
+        raise ValueError(
+            f"task.sensor = {task.sensor!r} is what a pinhole camera gets wrong, but task.camera = {task.camera!r}; "
+            "allowed with it is pinhole"
+        )
+    return sensor
+
+
+def _spread(sensor: Sensor) -> tuple[float, float]:
+    """Return how far objects differ from their models, in mass and in friction."""
+    return sensor.mass_spread, sensor.friction_spread
 
 
 def eligible_targets(robot: Robot, bank: HullBank, *, origin: str = "hull bank") -> np.ndarray:
@@ -285,11 +346,18 @@ def longest_push(config: Config) -> float:
 
 
 def with_task(env: Env, **changes: object) -> Env:
-    """Return the same scenes and engine under a changed task, for example another `r_out` or camera."""
+    """Return the same scenes and engine under a changed task, for example another `r_out` or camera.
+
+    Raises:
+        ValueError: a sensor under which the objects themselves would be others.
+    """
     task = dataclasses.replace(env.task, **changes)  # pyright: ignore[reportArgumentType]
+    sensor = sensor_of(task)
+    if (_spread(sensor), sensor.seed) != (_spread(env.sensor), env.sensor.seed) and _spread(sensor) != _spread(CLEAN):
+        raise ValueError(f"task.sensor = {task.sensor!r} has other objects than {env.task.sensor!r}; allowed is `make_env`")
     reach = max(env.max_distance, task.r_out)
     primitive, rules = make_task(task, env.robot, env.workspace, env.bank, max_distance=reach)
-    return dataclasses.replace(env, task=task, primitive=primitive, rules=rules, max_distance=reach)
+    return dataclasses.replace(env, task=task, primitive=primitive, rules=rules, max_distance=reach, sensor=sensor)
 
 
 def _turn(pose: jax.Array, *, yaw: jax.Array) -> jax.Array:
