@@ -367,20 +367,43 @@ def from_dict(values: Mapping[str, Any], cls: type = Config, prefix: str = "") -
     unknown = sorted(set(values) - set(hints), key=str)
     if unknown:
         raise ValueError(f"unknown config key {prefix}{unknown[0]}; allowed here: {', '.join(sorted(hints))}")
-    fields = {}
-    for name, value in values.items():
-        if dataclasses.is_dataclass(hints[name]):
-            fields[name] = from_dict(value, typing.cast(type, hints[name]), f"{prefix}{name}.")
-        else:
-            fields[name] = _checked(value, hints[name], f"{prefix}{name}")
-    return cls(**fields)
+    required = [field.name for field in dataclasses.fields(cls) if _has_no_default(field)]
+    if missing := [name for name in required if name not in values]:
+        raise ValueError(f"config key {prefix}{missing[0]} is missing")
+    return cls(**{name: _read(value, hints[name], f"{prefix}{name}") for name, value in values.items()})
+
+
+def _has_no_default(field: dataclasses.Field[Any]) -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+
+
+def _read(value: Any, hint: Any, key: str) -> Any:
+    """Return a value as its type hint wants it: a dataclass, a tuple or a mapping of something, or a plain value."""
+    if hint is Any:
+        return value
+    if dataclasses.is_dataclass(hint):
+        return from_dict(value, typing.cast(type, hint), f"{key}.")
+    if typing.get_origin(hint) is tuple:
+        inner = typing.get_args(hint)
+        if not isinstance(value, list | tuple) or (inner[-1] is not Ellipsis and len(value) != len(inner)):
+            count = "" if inner[-1] is Ellipsis else f" of {len(inner)}"
+            raise ValueError(f"{key} = {value!r} has the wrong type; allowed: a list{count}")
+        return tuple(_read(item, inner[0], f"{key}[{index}]") for index, item in enumerate(value))
+    if typing.get_origin(hint) is dict:
+        if not isinstance(value, Mapping):
+            raise ValueError(f"{key} = {value!r} has the wrong type; allowed: a mapping")
+        return {name: _read(item, typing.get_args(hint)[1], f"{key}.{name}") for name, item in value.items()}
+    options = [option for option in typing.get_args(hint) if option is not type(None)]
+    if value is not None and len(options) == 1 and (dataclasses.is_dataclass(options[0]) or typing.get_origin(options[0])):
+        return _read(value, options[0], key)
+    return _checked(value, hint, key)
 
 
 def _checked(value: Any, hint: Any, key: str) -> Any:
     """Return `value` if it is of type `hint` (an int passes for a float)."""
     origin = typing.get_origin(hint)
     if origin is Literal:
-        if value not in typing.get_args(hint):
+        if not isinstance(value, typing.Hashable) or value not in typing.get_args(hint):
             raise ValueError(f"{key} = {value!r} is unknown; allowed: {', '.join(typing.get_args(hint))}")
         return value
     allowed = typing.get_args(hint) if origin in (typing.Union, types.UnionType) else (hint,)

@@ -10,8 +10,8 @@ from pregrasp_jax.geometry import quat_from_yaw
 from pregrasp_jax.robot.base import ClosingRegion, Eligibility, first_obstruction, hand_pose_of
 from pregrasp_jax.robot.floating import JOINTS, make_floating_hand
 from pregrasp_jax.scene.spec import compile_spec, scene_spec
+from pregrasp_jax.spaces.motion import minimum_jerk
 from pregrasp_jax.spaces.workspace import TABLE, Box, Workspace
-from pregrasp_jax.task.primitive import minimum_jerk
 from pregrasp_jax.types import CTRL_DT, OBSTRUCTIONS
 
 GRIPPER = """

@@ -10,8 +10,8 @@ import pregrasp_jax
 PACKAGE = Path(pregrasp_jax.__file__).parent
 ORDER = [
     ["messages"],
-    ["io", "types", "yaml_file"],
-    ["config", "geometry", "machine", "spaces", "startup"],
+    ["io", "spaces", "types", "yaml_file"],
+    ["config", "geometry", "machine", "startup"],
     ["assets"],
     ["robot"],
     ["scene"],

@@ -14,8 +14,9 @@ from pregrasp_jax.robot import get_robot
 from pregrasp_jax.robot.ur5e_rg2 import FINGER_OPEN
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses
+from pregrasp_jax.spaces.motion import minimum_jerk
 from pregrasp_jax.spaces.workspace import TABLE
-from pregrasp_jax.task.primitive import Stroke, minimum_jerk
+from pregrasp_jax.task.primitive import Stroke
 from pregrasp_jax.task.push import num_push_rows, plan_push
 from pregrasp_jax.types import CTRL_DT, SceneParams
 

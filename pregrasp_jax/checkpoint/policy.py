@@ -30,7 +30,10 @@ PRETRAINED = Path(__file__).parent.parent / "pretrained"
 """The policy that ships with the package."""
 
 _PARAMS = "params.safetensors"
-_ALLOWED = f"pretrained, a run folder, or a folder with the {_PARAMS} that it wrote"
+BUNDLED = "policy.safetensors"
+"""The same file in an exported bundle."""
+
+_ALLOWED = f"pretrained, a run folder, a folder with the {_PARAMS} that it wrote, or an exported bundle"
 
 
 @dataclass(frozen=True)
@@ -52,12 +55,16 @@ class TrainedPolicy:
 
 def save_policy(folder: Path, params: Any, config: Config, evaluation: dict[str, Any]) -> None:
     """Write a policy. `params.safetensors` alone is complete; the two other files repeat its header for people."""
-    arrays = trees.named_leaves(params)
-    about = {"format": FORMAT, "config": json.dumps(to_dict(config)), "evaluation": json.dumps(evaluation)}
-    metadata = about | {"checksum": _checksum(arrays, about)}
-    io.write_bytes(folder / _PARAMS, trees.encode(arrays, metadata))
+    io.write_bytes(folder / _PARAMS, policy_bytes(params, config, evaluation))
     write_config(folder / CONFIG, config)
     io.write_json(folder / "evaluation.json", evaluation)
+
+
+def policy_bytes(params: Any, config: Config, evaluation: dict[str, Any]) -> bytes:
+    """Return a policy as safetensors: its parameters, and in the header everything else."""
+    arrays = trees.named_leaves(params)
+    about = {"format": FORMAT, "config": json.dumps(to_dict(config)), "evaluation": json.dumps(evaluation)}
+    return trees.encode(arrays, about | {"checksum": _checksum(arrays, about)})
 
 
 def load_policy(path: Path | str) -> TrainedPolicy:
@@ -69,7 +76,7 @@ def load_policy(path: Path | str) -> TrainedPolicy:
         ValueError: nothing there, damaged, or not written by `save_policy`; one line says which.
     """
     path = PRETRAINED if str(path) == "pretrained" else Path(path)
-    for candidate in (path, path / _PARAMS, path / "best" / _PARAMS):
+    for candidate in (path, path / _PARAMS, path / "best" / _PARAMS, path / BUNDLED):
         if candidate.is_file():
             try:
                 return _read_policy(candidate)

@@ -90,7 +90,9 @@ def _compact_values(graph: Graph, params: Params, config: Config, actions: Actio
     if config.network.mirror:
         windows.append(_read_window(graph, cells, row, col, rows - 1 - own, cols))
         origins.append(graph("Sub", np.array(SIZE - rows), row))
-    window, origin_rows = (graph("Concat", *parts, axis=0) if len(parts) > 1 else parts[0] for parts in (windows, origins))
+    window, origin_rows = (
+        graph("Concat", *parts, axis=0) if len(parts) > 1 else parts[0] for parts in (windows, origins)
+    )
     origin_cols = graph("Concat", *[col] * len(origins), axis=0) if len(origins) > 1 else col
     x = graph("SpaceToDepth", graph("Transpose", window, perm=[0, 3, 1, 2]), blocksize=PATCH)
     x = graph("Concat", x, _coordinates(graph, origin_rows, origin_cols, (rows - 1, cols)), axis=1)

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -151,7 +151,13 @@ def get_sensor(name: str) -> Sensor:
 
 
 def sense(
-    sensor: Sensor, hulls: HullInstances, camera: Camera, *, episode: jax.Array, num_pushes: jax.Array, target: jax.Array
+    sensor: Sensor,
+    hulls: HullInstances,
+    camera: Camera,
+    *,
+    episode: jax.Array,
+    num_pushes: jax.Array,
+    target: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Look through the pinhole as a real sensor does; see `views.pinhole`, which is that of an exact one.
 

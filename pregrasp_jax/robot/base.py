@@ -12,23 +12,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from pregrasp_jax.robot.links import Links
+from pregrasp_jax.robot.chain import Links
+from pregrasp_jax.robot.following import Body
+from pregrasp_jax.robot.region import ClosingRegion
 from pregrasp_jax.spaces.workspace import Workspace
 from pregrasp_jax.types import OBSTRUCTIONS, HandPose, HullBank
-
-
-class ClosingRegion(NamedTuple):
-    """What the closing fingers sweep, in the hand frame (x forward, y to the side), symmetric about y = 0.
-
-    Attributes:
-        x: [P] m, increasing stations along the hand; the first is the palm.
-        half_width: [P] m, half of the region's width there, linear in between.
-        exists: () bool; there is no region unless the fingers are open.
-    """
-
-    x: jax.Array | np.ndarray
-    half_width: jax.Array | np.ndarray
-    exists: jax.Array | np.ndarray | bool
 
 
 class Eligibility(NamedTuple):
@@ -63,6 +51,8 @@ class Robot:
         closing_region: (aperture () rad) -> `ClosingRegion`; None for a hand without one.
         eligibility: host; (hull bank) -> `Eligibility`.
         grasp_aperture: rad, commanded to close with constant force.
+        body: of an arm with closed-form kinematics, so that a deployed policy can do without MuJoCo; None if there is
+            none.
     """
 
     name: str
@@ -79,6 +69,7 @@ class Robot:
     closing_region: Callable[[jax.Array], ClosingRegion] | None
     eligibility: Callable[[HullBank], Eligibility]
     grasp_aperture: float
+    body: Body | None = None
 
     def joint_qpos_ids(self, mj_model: mujoco.MjModel) -> np.ndarray:
         """Return the addresses [J] in qpos of the joints."""

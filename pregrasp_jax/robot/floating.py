@@ -15,7 +15,8 @@ import numpy as np
 from pregrasp_jax.geometry import quat_from_yaw
 from pregrasp_jax.robot import clearance
 from pregrasp_jax.robot.base import ClosingRegion, Eligibility, Robot, first_obstruction
-from pregrasp_jax.robot.links import Links, make_links
+from pregrasp_jax.robot.chain import Links
+from pregrasp_jax.robot.links import make_links
 from pregrasp_jax.spaces.workspace import Workspace
 from pregrasp_jax.types import CTRL_DT, HandPose, HullBank
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax import geometry, heightmap, startup
-from pregrasp_jax.assets import variants
+from pregrasp_jax.assets import spread
 from pregrasp_jax.assets.sets import load_bank_for
 from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.heightmap import SENSORS, Sensor
@@ -252,8 +252,8 @@ def assemble(
     reach, sensor, num_variants = longest_push(config), sensor_of(config.task), 1
     if _spread(sensor) != _spread(CLEAN):
         mass_spread, friction_spread = _spread(sensor)
-        bank = variants.vary(bank, mass_spread=mass_spread, friction_spread=friction_spread, seed=sensor.seed)
-        num_variants, eligible = variants.NUM_VARIANTS, np.tile(eligible, variants.NUM_VARIANTS)
+        bank = spread.vary(bank, mass_spread=mass_spread, friction_spread=friction_spread, seed=sensor.seed)
+        num_variants, eligible = spread.NUM_VARIANTS, np.tile(eligible, spread.NUM_VARIANTS)
     parts = make_task(config.task, robot, workspace, bank, max_distance=reach)
     engine = make_engine(config.physics.engine, bank, robot, workspace, threads=threads)
     return Env(config.task, workspace, robot, *parts, bank, eligible, scenes, engine, reach, sensor, num_variants)
@@ -354,7 +354,9 @@ def with_task(env: Env, **changes: object) -> Env:
     task = dataclasses.replace(env.task, **changes)  # pyright: ignore[reportArgumentType]
     sensor = sensor_of(task)
     if (_spread(sensor), sensor.seed) != (_spread(env.sensor), env.sensor.seed) and _spread(sensor) != _spread(CLEAN):
-        raise ValueError(f"task.sensor = {task.sensor!r} has other objects than {env.task.sensor!r}; allowed is `make_env`")
+        raise ValueError(
+            f"task.sensor = {task.sensor!r} has other objects than {env.task.sensor!r}; allowed is `make_env`"
+        )
     reach = max(env.max_distance, task.r_out)
     primitive, rules = make_task(task, env.robot, env.workspace, env.bank, max_distance=reach)
     return dataclasses.replace(env, task=task, primitive=primitive, rules=rules, max_distance=reach, sensor=sensor)

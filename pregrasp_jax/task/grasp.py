@@ -4,8 +4,9 @@ import jax.numpy as jnp
 
 from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.robot.closing_region import scene_coverage
+from pregrasp_jax.spaces.motion import minimum_jerk
 from pregrasp_jax.spaces.workspace import Workspace
-from pregrasp_jax.task.primitive import Plan, follow, minimum_jerk
+from pregrasp_jax.task.primitive import Plan, follow
 from pregrasp_jax.types import CTRL_DT, EnvState, GraspResult, HandPose, HullBank, PhysicsObservation
 
 LIFT_HEIGHT, LIFT_SPEED = 0.2, 0.1

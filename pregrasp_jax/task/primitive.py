@@ -111,12 +111,3 @@ def follow(
     ctrl, code = robot.follow(joint_pos, poses, path.aperture, workspace)
     first = code[jnp.argmax(code != OBSTRUCTIONS.index("none"))]
     return make_plan(ctrl, num_ctrl, seconds, first, hand).unless(num_ctrl > len(ctrl), "too_long")
-
-
-def minimum_jerk(share: jax.Array) -> jax.Array:
-    """Return the travelled share [...] of a minimum-jerk motion after a `share` [...] of its time, clipped to [0, 1].
-
-    Source: Flash and Hogan 1985, 10 s^3 - 15 s^4 + 6 s^5.
-    """
-    s = jnp.clip(share, 0.0, 1.0)
-    return s**3 * (10 - 15 * s + 6 * s**2)
