@@ -11,7 +11,7 @@ from pregrasp_jax.robot.base import hand_pose_of
 from pregrasp_jax.robot.ur5e_rg2 import FINGER_CLOSED, FINGER_OPEN
 from pregrasp_jax.spaces import grid, motion
 from pregrasp_jax.spaces.workspace import TABLE
-from pregrasp_jax.task import primitive, push
+from pregrasp_jax.task import push
 from pregrasp_jax.task.primitive import Stroke
 from pregrasp_jax.types import CTRL_DT, OBSTRUCTIONS
 

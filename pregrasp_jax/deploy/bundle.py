@@ -92,4 +92,3 @@ def check_contract(document: object, *, origin: str) -> Contract:
         return from_dict(document, Contract)  # pyright: ignore[reportArgumentType]
     except ValueError as error:
         raise ValueError(f"{origin}: {error}") from None
-

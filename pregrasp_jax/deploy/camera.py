@@ -35,7 +35,13 @@ class PinholeCamera:
 
     def __post_init__(self):
         k = np.asarray(self.matrix, float)
-        if k.shape != (3, 3) or not np.isfinite(k).all() or min(k[0, 0], k[1, 1]) <= 1 or k[2, 2] != 1 or k[2, :2].any():
+        if (
+            k.shape != (3, 3)
+            or not np.isfinite(k).all()
+            or min(k[0, 0], k[1, 1]) <= 1
+            or k[2, 2] != 1
+            or k[2, :2].any()
+        ):
             raise ValueError(
                 f"camera intrinsics are {k.tolist()}; allowed is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
             )
@@ -63,14 +69,14 @@ class PinholeCamera:
         return np.stack([col, row], axis=-1), depth
 
     def rays(self, rows: slice, columns: slice) -> np.ndarray:
-        """Return directions [R, C, 3] float32 through pixels of a part of the image, at depth 1 m, in the world."""
+        """Return directions [3, R, C] float32 through pixels of a part of the image, at depth 1 m, in the world."""
         v, u = np.meshgrid(np.arange(rows.start, rows.stop), np.arange(columns.start, columns.stop), indexing="ij")
         k = self.matrix
         x, y = (u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1]
         if any(self.distortion):
             x, y = _undistorted(x, y, self.distortion)
-        local = np.stack([x, y, np.ones_like(x)], axis=-1)
-        return (local @ self.world_from_optical[:3, :3].T).astype(np.float32)
+        local = np.stack([x, y, np.ones_like(x)])
+        return np.tensordot(self.world_from_optical[:3, :3], local, axes=1).astype(np.float32)
 
 
 def _undistorted(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +106,9 @@ def refuse_pose(matrix: np.ndarray, *, what: str) -> None:
     if off > _ROTATION_ERROR or np.abs(matrix[3] - [0, 0, 0, 1]).max() > _ROTATION_ERROR:
         raise ValueError(f"{what} is no rotation and shift (off by {off:.3g}); allowed is {_ROTATION_ERROR:g}")
     if np.abs(matrix[:3, 3]).max() > 10:
-        raise ValueError(f"{what} lies {np.abs(matrix[:3, 3]).max():g} m away; allowed is 10 m (are these millimetres?)")
+        raise ValueError(
+            f"{what} lies {np.abs(matrix[:3, 3]).max():g} m away; allowed is 10 m (are these millimetres?)"
+        )
 
 
 def optical_from(pose: np.ndarray, frame: str) -> np.ndarray:

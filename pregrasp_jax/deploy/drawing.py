@@ -75,7 +75,7 @@ def draw_hulls(hulls: list[WorldHull], *, camera: PinholeCamera, crop: "Crop") -
             continue
         rows, columns = _covered(_outline(pixels), size)
         if rows.size:
-            yield DrawnHull(rows, columns, _depth(hull.planes, crop.rays[rows, columns], camera))
+            yield DrawnHull(rows, columns, _depth(hull.planes, crop.rays[:, rows, columns], camera))
 
 
 def _outline(points: np.ndarray) -> np.ndarray:
@@ -120,7 +120,7 @@ def _covered(outline: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _depth(planes: np.ndarray, rays: np.ndarray, camera: PinholeCamera) -> np.ndarray:
-    """Return the depth [P] m at which rays [P, 3] from the camera enter a hull: behind the last face that they meet.
+    """Return the depth [P] m at which rays [3, P] from the camera enter a hull: behind the last face that they meet.
 
     A ray meets the plane n . x = d at (d - n . camera) / (n . ray); of the faces that look at the camera the farthest
     counts.
@@ -128,4 +128,4 @@ def _depth(planes: np.ndarray, rays: np.ndarray, camera: PinholeCamera) -> np.nd
     offset = planes[:, 3] - planes[:, :3] @ camera.world_from_optical[:3, 3]
     facing = offset < -_FACING
     normals = (planes[facing, :3] / offset[facing, None]).astype(np.float32)
-    return 1 / (rays @ np.unique(normals, axis=0).T).min(axis=1)
+    return 1 / (np.unique(normals, axis=0) @ rays).min(axis=0)

@@ -55,7 +55,9 @@ class Target:
             return self.index
         if self.name is not None:
             if self.name not in masks.names:
-                raise ValueError(f"target name {self.name!r} was not found; found: {', '.join(sorted(set(masks.names)))}")
+                raise ValueError(
+                    f"target name {self.name!r} was not found; found: {', '.join(sorted(set(masks.names)))}"
+                )
             return masks.names.index(self.name)
         assert self.pixel is not None
         column, row = self.pixel

@@ -24,8 +24,8 @@ CELLS = ("max", "second", "median")
 _TOP = 0.45
 """m above the table, of the box whose view the image is cut to; higher things are clipped to 0.30 m anyway."""
 
-_FAR = 1e-3
-"""m; a cell's point is at most so far below the table before it counts as a hole in the calibration."""
+_LIMIT, _LEVELS = 2.0, 2**23 - 1
+"""m above which heights are clipped, and the steps in between."""
 
 
 class Maps(NamedTuple):
@@ -49,7 +49,7 @@ class Crop:
     Attributes:
         rows: of pixels.
         columns: of pixels.
-        rays: [R, C, 3] float32, world directions at depth 1 m.
+        rays: [3, R, C] float32, world directions at depth 1 m.
     """
 
     rows: slice
@@ -111,7 +111,14 @@ def project(
 
 
 def draw_robot(
-    depth: np.ndarray, labels: np.ndarray, *, camera: PinholeCamera, crop: Crop, body: Body, joint_pos: np.ndarray, label: int
+    depth: np.ndarray,
+    labels: np.ndarray,
+    *,
+    camera: PinholeCamera,
+    crop: Crop,
+    body: Body,
+    joint_pos: np.ndarray,
+    label: int,
 ) -> None:
     """Draw the robot into a cut depth image and its labels, in place."""
     for drawn in draw_hulls(link_hulls(body.links, joint_pos), camera=camera, crop=crop):
@@ -126,18 +133,17 @@ def draw_robot(
 
 def to_maps(depth: np.ndarray, labels: np.ndarray, *, camera: PinholeCamera, crop: Crop, cell: str = "max") -> Maps:
     """Project a cut depth image with its labels upward to the grid; `heightmap.views.project_upward`."""
-    known = np.isfinite(depth)
-    distance = depth[known]
-    points = crop.rays[known] * distance[:, None] + camera.world_from_optical[:3, 3].astype(np.float32)
-    at = np.floor((points[:, :2] + np.float32(grid.WORKSPACE_HALF_SIZE)) / np.float32(grid.HEIGHTMAP_RESOLUTION))
-    on_grid = (at >= 0).all(axis=1) & (at < grid.GRID_SIZE).all(axis=1)
-    at = at[on_grid].astype(np.int32)
-    index = at[:, 1] * grid.GRID_SIZE + at[:, 0]
-    # The label stands in the lowest bits, so that of equal heights the larger label wins.
-    keys = np.round(np.clip(points[on_grid, 2], 0.0, 2.0) * 1e6).astype(np.int64) * 256 + labels[known][on_grid]
-    chosen, counted = _choose(index, keys, cell)
+    place, per_cell = camera.world_from_optical[:3, 3].astype(np.float32), np.float32(1 / grid.HEIGHTMAP_RESOLUTION)
+    half = np.float32(grid.WORKSPACE_HALF_SIZE)
+    col, row = ((crop.rays[axis] * depth + (place[axis] + half)) * per_cell for axis in (0, 1))
+    on_grid = (col >= 0) & (col < grid.GRID_SIZE) & (row >= 0) & (row < grid.GRID_SIZE)  # False for NaN
+    height = crop.rays[2][on_grid] * depth[on_grid] + place[2]
+    index = row[on_grid].astype(np.int32) * grid.GRID_SIZE + col[on_grid].astype(np.int32)
+    # Keys as those of `heightmap.rasterizer`: of equal heights the larger label wins.
+    level = np.rint(np.clip(height, 0.0, _LIMIT) * np.float32(_LEVELS / _LIMIT)).astype(np.int32)
+    chosen, counted = _choose(index, level * 256 + labels[on_grid], cell)
     size = (grid.GRID_SIZE, grid.GRID_SIZE)
-    heights = (chosen >> 8).astype(np.float32) * np.float32(1e-6)
+    heights = (chosen >> 8).astype(np.float32) * np.float32(_LIMIT / _LEVELS)
     return Maps(heights.reshape(size), (chosen & 255).astype(np.uint8).reshape(size), float((counted > 0).mean()))
 
 
@@ -145,11 +151,11 @@ def _choose(index: np.ndarray, keys: np.ndarray, cell: str) -> tuple[np.ndarray,
     """Return the chosen key of every cell (0 without a point), and how many points it has."""
     num_cells = grid.GRID_SIZE**2
     counted = np.bincount(index, minlength=num_cells)
-    chosen = np.zeros(num_cells, np.int64)
+    chosen = np.zeros(num_cells, np.int32)
     if cell == "max":
         np.maximum.at(chosen, index, keys)
         return chosen, counted
-    order = np.argsort((index.astype(np.int64) << 40) + keys)
+    order = np.argsort((index.astype(np.int64) << 32) + keys)
     first = np.concatenate([[0], np.cumsum(counted)[:-1]])
     place = counted // 2 if cell == "median" else np.maximum(counted - 2, 0)
     held = counted > 0

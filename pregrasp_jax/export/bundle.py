@@ -92,7 +92,8 @@ def _refuse(folder: Path, formats: Sequence[str], golden: int, force: bool) -> N
 def _write(folder: Path, contract: Contract, files: dict[str, bytes]) -> Contract:
     """Write all files beside the folder, then put them into its place."""
     entries = {
-        name: FileEntry(sha256=hashlib.sha256(data).hexdigest(), bytes=len(data)) for name, data in sorted(files.items())
+        name: FileEntry(sha256=hashlib.sha256(data).hexdigest(), bytes=len(data))
+        for name, data in sorted(files.items())
     }
     contract = dataclasses.replace(contract, files=entries)
     folder.parent.mkdir(parents=True, exist_ok=True)

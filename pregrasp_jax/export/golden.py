@@ -81,9 +81,7 @@ def make_views(robot: Robot, workspace: Workspace, primitive: Primitive, *, coun
     return views
 
 
-def make_golden(
-    views: list[View], q_function: QFunction, params: Any, primitive: Primitive
-) -> dict[str, np.ndarray]:
+def make_golden(views: list[View], q_function: QFunction, params: Any, primitive: Primitive) -> dict[str, np.ndarray]:
     """Return the arrays of golden.npz for a policy."""
     segmentation = [np.asarray(heightmap.fuse_segmentation(jnp.asarray(v.ids), jnp.int32(v.target))) for v in views]
     inputs = {

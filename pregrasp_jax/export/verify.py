@@ -74,7 +74,9 @@ def compare(name: str, q: np.ndarray, golden: Golden, tolerance: float) -> Findi
     """Return how values [S, H, W, K] differ from the golden ones, and whether the same pushes are best."""
     wanted = golden["q"]
     if q.shape != wanted.shape or not np.isfinite(q).all():
-        return Finding(name, False, f"values of shape {list(q.shape)}, some not finite, instead of {list(wanted.shape)}")
+        return Finding(
+            name, False, f"values of shape {list(q.shape)}, some not finite, instead of {list(wanted.shape)}"
+        )
     off = float(np.abs(q - wanted).max())
     best = q.reshape(len(q), -1).argmax(axis=1)
     given_up = wanted.reshape(len(q), -1).max(axis=1) - wanted.reshape(len(q), -1)[np.arange(len(q)), best]
