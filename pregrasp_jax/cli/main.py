@@ -38,19 +38,24 @@ class Command:
 
 COMMANDS = {
     "assets": Command("List and draw the objects of a mesh folder.", "pregrasp_jax.cli.commands:assets"),
+    "calibrate-check": Command("Say how well a calibration fits the table.", "pregrasp_jax.cli.deploy:calibrate_check"),
     "compare": Command("Compare two evaluations on the same scenes.", "pregrasp_jax.cli.commands:compare"),
+    "contract": Command("Print what a bundle says about itself.", "pregrasp_jax.cli.export:contract"),
     "demo": Command("See the shipped policy at work, then train for minutes.", "pregrasp_jax.cli.demo:demo"),
+    "deploy": Command("Run a bundle on a robot, or in simulation.", "pregrasp_jax.cli.deploy:deploy"),
     "doctor": Command("Say what this machine offers.", "pregrasp_jax.cli.commands:doctor"),
     "evaluate": Command(
         "Evaluate a policy on fixed test scenes.",
         "pregrasp_jax.cli.evaluate:evaluate_options",
         aliases="pregrasp_jax.cli.evaluate:ALIASES",
     ),
+    "export": Command("Write a policy as a bundle that runs without JAX.", "pregrasp_jax.cli.export:export"),
     "replay-dump": Command("Repeat a push on which the physics diverged.", "pregrasp_jax.cli.replay:replay_dump"),
     "report": Command("Write the page of a run.", "pregrasp_jax.cli.report:report"),
     "scenes": Command("Describe and draw a bank of packed scenes.", "pregrasp_jax.cli.commands:scenes"),
     "show": Command("Draw one decision of a policy.", "pregrasp_jax.cli.commands:show"),
     "train": Command("Train a policy, or continue a run.", "pregrasp_jax.cli.train:sessions", nested=True),
+    "verify": Command("Compare every file of a bundle with its golden answers.", "pregrasp_jax.cli.export:verify"),
 }
 
 

@@ -1,5 +1,6 @@
 """From the two maps to a push: the best one that is allowed and that the arm can make, or that it is time to close."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -98,13 +99,21 @@ class Decider:
         widest = max(entry.choices, key=lambda choice: choice.aperture_rad)
         return _held(np.array(entry.start_m), widest)
 
-    def decide(self, maps: Maps, hand: motion.Held, joint_pos: np.ndarray) -> Decision:
+    def decide(
+        self,
+        maps: Maps,
+        hand: motion.Held,
+        joint_pos: np.ndarray,
+        *,
+        lap: Callable[[str], None] = lambda _: None,
+    ) -> Decision:
         """Return what to do next.
 
         Args:
             maps: what is seen.
             hand: commanded end of the last push; `start` before the first.
             joint_pos: [J] rad, measured.
+            lap: told when a part of the work is done.
 
         Raises:
             ValueError: joints or maps are not usable, or the target is not seen.
@@ -124,7 +133,9 @@ class Decider:
         if end is not None and region_exists and coverage > end.coverage:
             return Decision(True, coverage, None, (), None, allowed)
         p1 = np.asarray(hand.xy, np.float32)
+        lap("region")
         q = self.values(maps.height_m[None], maps.labels[None], p1[None])[0]
+        lap("network")
         push, refused = self._best(q, allowed, hand, joint_pos)
         return Decision(False, coverage, push, refused, q, allowed)
 

@@ -121,8 +121,8 @@ def from_mask_rcnn(output: Any, names: Mapping[int, str] | None = None, *, min_s
         masks = masks[:, 0]
     if masks.ndim != 3 or not len(masks) == len(labels) == len(scores):
         raise ValueError(
-            f"Mask R-CNN masks have shape {list(masks.shape)} for {len(labels)} labels; allowed is [N, 1, rows, columns] "
-            "or [N, rows, columns]"
+            f"Mask R-CNN masks have shape {list(masks.shape)} for {len(labels)} labels; allowed is [N, 1, rows, "
+            "columns] or [N, rows, columns]"
         )
     masks = masks > THRESHOLD if masks.dtype.kind == "f" else masks.astype(bool)
     sure = np.flatnonzero(scores >= min_score)

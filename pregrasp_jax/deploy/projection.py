@@ -133,18 +133,27 @@ def draw_robot(
 
 def to_maps(depth: np.ndarray, labels: np.ndarray, *, camera: PinholeCamera, crop: Crop, cell: str = "max") -> Maps:
     """Project a cut depth image with its labels upward to the grid; `heightmap.views.project_upward`."""
-    place, per_cell = camera.world_from_optical[:3, 3].astype(np.float32), np.float32(1 / grid.HEIGHTMAP_RESOLUTION)
-    half = np.float32(grid.WORKSPACE_HALF_SIZE)
-    col, row = ((crop.rays[axis] * depth + (place[axis] + half)) * per_cell for axis in (0, 1))
-    on_grid = (col >= 0) & (col < grid.GRID_SIZE) & (row >= 0) & (row < grid.GRID_SIZE)  # False for NaN
-    height = crop.rays[2][on_grid] * depth[on_grid] + place[2]
-    index = row[on_grid].astype(np.int32) * grid.GRID_SIZE + col[on_grid].astype(np.int32)
+    cells = cells_of(depth, camera=camera, crop=crop)
+    on_grid = cells < grid.GRID_SIZE**2
+    index = cells[on_grid]
+    height = crop.rays[2][on_grid] * depth[on_grid] + np.float32(camera.world_from_optical[2, 3])
     # Keys as those of `heightmap.rasterizer`: of equal heights the larger label wins.
     level = np.rint(np.clip(height, 0.0, _LIMIT) * np.float32(_LEVELS / _LIMIT)).astype(np.int32)
     chosen, counted = _choose(index, level * 256 + labels[on_grid], cell)
     size = (grid.GRID_SIZE, grid.GRID_SIZE)
     heights = (chosen >> 8).astype(np.float32) * np.float32(_LIMIT / _LEVELS)
     return Maps(heights.reshape(size), (chosen & 255).astype(np.uint8).reshape(size), float((counted > 0).mean()))
+
+
+def cells_of(depth: np.ndarray, *, camera: PinholeCamera, crop: Crop) -> np.ndarray:
+    """Return the flat index [R, C] int32 of the cell above which each pixel lies; one past the last for none."""
+    place, per_cell = camera.world_from_optical[:3, 3].astype(np.float32), np.float32(1 / grid.HEIGHTMAP_RESOLUTION)
+    half = np.float32(grid.WORKSPACE_HALF_SIZE)
+    col, row = ((crop.rays[axis] * depth + (place[axis] + half)) * per_cell for axis in (0, 1))
+    on_grid = (col >= 0) & (col < grid.GRID_SIZE) & (row >= 0) & (row < grid.GRID_SIZE)  # False for NaN
+    with np.errstate(invalid="ignore"):
+        index = row.astype(np.int32) * grid.GRID_SIZE + col.astype(np.int32)
+    return np.where(on_grid, index, np.int32(grid.GRID_SIZE**2))
 
 
 def _choose(index: np.ndarray, keys: np.ndarray, cell: str) -> tuple[np.ndarray, np.ndarray]:

@@ -50,12 +50,12 @@ _INFERNO = _stops(
 
 def draw_heightmap(height: np.ndarray, *, size: int = 300) -> np.ndarray:
     """Draw heights [H, W], uint8 as observed, as a map of size x size pixels; brighter is higher."""
-    return _as_map(_colors(np.asarray(height, np.uint8) / 255, _CIVIDIS), size)
+    return as_map(_colors(np.asarray(height, np.uint8) / 255, _CIVIDIS), size)
 
 
 def draw_segmentation(instance_ids: np.ndarray, *, target_slot: int | None = None, size: int = 300) -> np.ndarray:
     """Draw instance ids [H, W] in the colours of `draw_camera` as a map of size x size pixels."""
-    return _as_map(instance_colors(target_slot)[np.asarray(instance_ids)], size)
+    return as_map(instance_colors(target_slot)[np.asarray(instance_ids)], size)
 
 
 def draw_labels(labels: np.ndarray, names: Mapping[str, int], *, size: int = 300) -> np.ndarray:
@@ -64,7 +64,7 @@ def draw_labels(labels: np.ndarray, names: Mapping[str, int], *, size: int = 300
     colors = np.zeros((max(names.values()) + 1, 3))
     for name, value in names.items():
         colors[value] = of_name[name]
-    return _as_map(colors[labels], size)
+    return as_map(colors[labels], size)
 
 
 def draw_q_map(
@@ -94,10 +94,10 @@ def draw_q_map(
     low, high = limits or (inside.min(), inside.max())
     colors = _colors((q - low) / max(high - low, 1e-9), _INFERNO)
     shade = np.zeros(q.shape) if backdrop is None else np.asarray(backdrop, float) / 255
-    image = _as_map(np.where(mask[..., None], colors, 70 + 110 * shade[..., None]), size)
+    image = as_map(np.where(mask[..., None], colors, 70 + 110 * shade[..., None]), size)
     picture = Image.fromarray(image)
     canvas = ImageDraw.Draw(picture)
-    fine = _as_map(np.repeat(mask[..., None], 3, axis=-1) * 255.0, size)[..., 0] > 0
+    fine = as_map(np.repeat(mask[..., None], 3, axis=-1) * 255.0, size)[..., 0] > 0
     padded = np.pad(fine, 1)
     interior = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     canvas.bitmap((0, 0), Image.fromarray(((fine & ~interior) * 255).astype(np.uint8)), fill=(240, 240, 240))
@@ -112,7 +112,7 @@ def _colors(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(values, at, channel) for channel in stops.T], axis=-1)
 
 
-def _as_map(values: np.ndarray, size: int) -> np.ndarray:
+def as_map(values: np.ndarray, size: int) -> np.ndarray:
     """Return cells [H, W, 3] in 0 to 255 as a picture with +y up."""
     return np.asarray(Image.fromarray(values[::-1].astype(np.uint8)).resize((size, size), Image.Resampling.NEAREST))
 

@@ -128,8 +128,8 @@ def _output(actions: ActionSpace) -> Tensor:
         unit="reward",
         frame="the same grid; last axis: choice",
         kind="target/push/value",
-        meaning="Expected discounted reward of a push that ends in the cell, the hand held as the choice says. Take the "
-        "largest among those that are allowed.",
+        meaning="Expected discounted reward of a push that ends in the cell, the hand held as the choice says. Take "
+        "the largest among those that are allowed.",
         low=None,
         high=None,
         invalid="pushes that are not allowed have values too.",

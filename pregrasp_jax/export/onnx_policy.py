@@ -166,7 +166,7 @@ def _window_origin(graph: Graph, size: WindowSize) -> tuple[str, str]:
 
 
 def _read_window(graph: Graph, cells: str, row: str, col: str, rows: np.ndarray, num_cols: int) -> str:
-    """Read cells [batch, H * W, C] at rows and columns that count from an origin: [batch, R, C, channels], 0 outside."""
+    """Read cells [batch, H * W, C] at rows and columns from an origin on: [batch, R, S, C], 0 outside."""
     at_rows, at_cols = graph("Add", row, rows), graph("Add", col, np.arange(num_cols))
     return _gather_cells(graph, cells, at_rows, at_cols, (SIZE, SIZE), (len(rows), num_cols))
 

@@ -37,7 +37,7 @@ class Finding:
 
     def line(self) -> str:
         """Return it as one line."""
-        return f"{self.name:<12}{ {True: 'ok', False: 'FAILED', None: 'skipped'}[self.passed]:<9}{self.text}"
+        return f"{self.name:<17}{ {True: 'ok', False: 'FAILED', None: 'skipped'}[self.passed]:<9}{self.text}"
 
 
 def verify(bundle: Bundle, *, formats: Sequence[str] = (), tolerance: float = 1e-4) -> list[Finding]:

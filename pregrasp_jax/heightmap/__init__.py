@@ -10,7 +10,7 @@ from pregrasp_jax.heightmap.observation import (
     robot_hulls,
     scene_hulls,
 )
-from pregrasp_jax.heightmap.sensor import SENSORS, Sensor, episode_key, get_sensor, sense
+from pregrasp_jax.heightmap.sensor import SENSORS, Photo, Sensor, episode_key, get_sensor, photograph, sense
 from pregrasp_jax.heightmap.views import (
     Camera,
     HullInstances,
@@ -25,6 +25,7 @@ __all__ = [
     "SENSORS",
     "Camera",
     "HullInstances",
+    "Photo",
     "Sensor",
     "episode_key",
     "fuse_segmentation",
@@ -34,6 +35,7 @@ __all__ = [
     "observe",
     "orthographic",
     "overhead_camera",
+    "photograph",
     "pinhole",
     "render_pinhole",
     "robot_hulls",

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -172,19 +172,49 @@ def sense(
     Returns:
         height [H, W] float32 m and instance ids [H, W] uint8.
     """
-    pose_key, image_key = jax.random.split(episode)
-    stereo_key, block_key, mask_key = jax.random.split(jax.random.fold_in(image_key, num_pushes), 3)
     rows, columns = camera.shape
     border = max(columns - rows, 0) // 2
     camera = camera.replace(shape=(rows, columns - 2 * border))  # the workspace is a square in the middle
+    photo = photograph(sensor, hulls, camera, episode=episode, num_pushes=num_pushes, target=target, border=border)
+    robot = photo.labels == ROBOT_ID
+    # The robot is drawn where its joints say that it is, whatever the calibration.
+    seen = jnp.where(robot[..., None], unproject(photo.exact, photo.actual), unproject(photo.depth, camera))
+    return project_upward(seen, photo.labels, robot | jnp.isfinite(photo.depth), cell=sensor.cell)
+
+
+class Photo(NamedTuple):
+    """What a camera gives, and what it does not know.
+
+    Attributes:
+        depth: [rows, columns] float32 m; NaN where there is none.
+        labels: [rows, columns] uint8 instance ids, as a segmentation would give them; the robot's own are exact.
+        exact: [rows, columns] float32 m, the depth without any error.
+        actual: where the camera really is.
+    """
+
+    depth: jax.Array
+    labels: jax.Array
+    exact: jax.Array
+    actual: Camera
+
+
+def photograph(
+    sensor: Sensor,
+    hulls: HullInstances,
+    camera: Camera,
+    *,
+    episode: jax.Array,
+    num_pushes: jax.Array,
+    target: jax.Array,
+    border: int = 0,
+) -> Photo:
+    """Return the image that a sensor takes; see `sense`, of whose camera `border` columns are cut off on each side."""
+    pose_key, image_key = jax.random.split(episode)
+    stereo_key, block_key, mask_key = jax.random.split(jax.random.fold_in(image_key, num_pushes), 3)
     actual = _displaced(camera, sensor, pose_key)
     exact, labels = render_pinhole(hulls, actual)
-    robot = labels == ROBOT_ID
     depth = _measured(exact, sensor, camera, stereo_key, block_key, border=border)
-    valid = robot | jnp.isfinite(depth)
-    # The robot is drawn where its joints say that it is, whatever the calibration.
-    seen = jnp.where(robot[..., None], unproject(exact, actual), unproject(depth, camera))
-    return project_upward(seen, _masks(labels, hulls, sensor, mask_key, target), valid, cell=sensor.cell)
+    return Photo(depth, _masks(labels, hulls, sensor, mask_key, target), exact, actual)
 
 
 def episode_key(sensor: Sensor, poses: jax.Array, target: jax.Array) -> jax.Array:
