@@ -38,8 +38,9 @@ class Programs:
         env, scene = self.env, state.scene
         hulls = heightmap.scene_hulls(env.bank, env.robot, scene, state.physics_obs, env.workspace)
         episode = heightmap.episode_key(env.sensor, scene.poses, scene.target)
-        about = {"episode": episode, "num_pushes": state.num_pushes, "target": scene.target}
-        photo = heightmap.photograph(env.sensor, hulls, self.camera, **about)
+        photo = heightmap.photograph(
+            env.sensor, hulls, self.camera, episode=episode, num_pushes=state.num_pushes, target=scene.target
+        )
         return photo.depth, photo.labels
 
     def _push(self, state: EnvState, end: HandPose) -> Any:

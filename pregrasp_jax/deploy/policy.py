@@ -46,7 +46,7 @@ def load_values(bundle: Bundle, *, threads: int = 1) -> Values:
         given = dict(zip((tensor.name for tensor in tensors), (height_m, labels, p1_m), strict=True))
         for tensor in tensors:
             refuse_tensor(tensor, given[tensor.name])
-        return session.run(None, given)[0]
+        return np.asarray(session.run(None, given)[0])
 
     return values
 

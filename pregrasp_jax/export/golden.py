@@ -76,8 +76,9 @@ def make_views(robot: Robot, workspace: Workspace, primitive: Primitive, *, coun
         nothing = {"diverged": jnp.bool_(False), "overflows": jnp.int32(0)}
         pose = robot.hand_pose(jnp.asarray(joints))
         seen = PhysicsObservation(scene.poses, jnp.asarray(joints), pose, **nothing)
-        found = jax.device_get(see(scene, seen))
-        views.append(View(*found[:2], np.asarray(joints), *found[2:], int(scenes.target[index]), jax.device_get(hand)))
+        depth, instances, height, ids = jax.device_get(see(scene, seen))
+        target, sent = int(scenes.target[index]), jax.device_get(hand)
+        views.append(View(depth, instances, np.asarray(joints), height, ids, target, sent))
     return views
 
 
@@ -100,11 +101,11 @@ def make_golden(views: list[View], q_function: QFunction, params: Any, primitive
         "action": actions,
         "push": np.array([[*s.end.xy, s.end.z, s.end.yaw, s.end.aperture] for s in strokes], np.float32),
         "depth": np.stack([view.depth for view in shown]),
-        "depth_scale": np.float64(DEPTH_SCALE),
+        "depth_scale": np.array(DEPTH_SCALE),
         "instances": np.stack([view.instances for view in shown]),
         "target_id": np.array([view.target + 1 for view in shown]),
         "joint_pos": np.stack([view.joint_pos for view in shown]),
-        "focal_px": np.float64(camera.focal),
+        "focal_px": np.array(float(camera.focal)),
         "camera_position_m": np.asarray(camera.position),
         "camera_rotation": np.asarray(camera.rotation),
         "seen_height_m": np.stack([view.height for view in shown]),
