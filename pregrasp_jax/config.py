@@ -393,13 +393,11 @@ def _read(value: Any, hint: Any, key: str) -> Any:
         if not isinstance(value, Mapping):
             raise ValueError(f"{key} = {value!r} has the wrong type; allowed: a mapping")
         return {name: _read(item, typing.get_args(hint)[1], f"{key}.{name}") for name, item in value.items()}
-    options = [option for option in typing.get_args(hint) if option is not type(None)]
-    if (
-        value is not None
-        and len(options) == 1
-        and (dataclasses.is_dataclass(options[0]) or typing.get_origin(options[0]))
-    ):
-        return _read(value, options[0], key)
+    nested = [
+        option for option in typing.get_args(hint) if dataclasses.is_dataclass(option) or typing.get_origin(option)
+    ]
+    if len(nested) == 1 and isinstance(value, list | tuple | Mapping):
+        return _read(value, nested[0], key)
     return _checked(value, hint, key)
 
 

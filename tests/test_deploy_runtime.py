@@ -1,6 +1,7 @@
 """The runtime without JAX: what it computes is what the package computes, and what it cannot use it refuses."""
 
 import dataclasses
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from bundles import small_bundle
 
 from pregrasp_jax import heightmap
+from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.deploy.bundle import read_bundle
 from pregrasp_jax.deploy.camera import PinholeCamera, depth_in_metres
 from pregrasp_jax.deploy.decision import Decider, allowed_pushes, workspace_of
@@ -23,9 +25,10 @@ from pregrasp_jax.deploy.projection import Maps, make_crop, project, to_maps
 from pregrasp_jax.deploy.tabletop import components
 from pregrasp_jax.geometry import rigid_inverse
 from pregrasp_jax.heightmap.views import project_upward
-from pregrasp_jax.robot import clearance, get_robot, kinematics, robot_file
+from pregrasp_jax.robot import clearance, description, get_robot, kinematics, robot_file
 from pregrasp_jax.robot.following import follow
 from pregrasp_jax.spaces.workspace import TABLE, Box, Workspace
+from pregrasp_jax.task.push import make_push
 from pregrasp_jax.types import OBSTRUCTIONS
 
 ROBOT = get_robot("ur5e_rg2")
@@ -77,14 +80,16 @@ def random_joints(count: int) -> np.ndarray:
 def test_kinematics_of_numpy_are_those_of_jax():
     joints, arm = random_joints(20), ROBOT.body.arm
     flange = np.stack([kinematics.forward_kinematics(BODY.arm, row[:6])[-1] for row in joints])
-    wanted = np.asarray(jax.vmap(lambda q: kinematics.forward_kinematics(arm, q)[-1])(jnp.asarray(joints[:, :6])))
+    forward = jax.jit(jax.vmap(lambda q: kinematics.forward_kinematics(arm, q)[-1]))
+    wanted = np.asarray(forward(jnp.asarray(joints[:, :6])))
     np.testing.assert_allclose(flange, wanted, atol=2e-6)
     found = kinematics.inverse_kinematics(BODY.arm, flange)
-    solved = np.asarray(jax.vmap(lambda t: kinematics.inverse_kinematics(arm, t))(jnp.asarray(flange)))
+    inverse = jax.jit(jax.vmap(lambda pose: kinematics.inverse_kinematics(arm, pose)))
+    solved = np.asarray(inverse(jnp.asarray(flange, jnp.float32)))
     np.testing.assert_array_equal(np.isnan(found), np.isnan(solved))
     turn = np.angle(np.exp(1j * (found - solved)))
     assert np.nanmax(np.abs(turn)) < 5e-3, "float32 of jax near singular postures"
-    links = ROBOT.links.matrices(jnp.asarray(joints[0]))
+    links = jax.jit(ROBOT.links.matrices)(jnp.asarray(joints[0]))
     np.testing.assert_allclose(BODY.links.matrices(joints.astype(float))[0], np.asarray(links), atol=2e-6)
 
 
@@ -95,8 +100,8 @@ def test_clearance_of_numpy_is_that_of_jax():
         (clearance.distance_to_walls, BODY.moving, (WALLED,)),
     ):
         own = measure(BODY.links, geoms, joints.astype(float), *rest)
-        wanted = jax.vmap(lambda q, m=measure, r=rest, g=geoms: m(ROBOT.links, g, q, *r))(jnp.asarray(joints))
-        np.testing.assert_allclose(own, np.asarray(wanted), atol=1e-5)
+        of_jax = jax.jit(jax.vmap(lambda q, m=measure, r=rest, g=geoms: m(ROBOT.links, g, q, *r)))
+        np.testing.assert_allclose(own, np.asarray(of_jax(jnp.asarray(joints))), atol=1e-5)
 
 
 @pytest.mark.parametrize("place", [TABLE, WALLED], ids=lambda place: place.name)
@@ -116,8 +121,16 @@ def test_what_keeps_the_hand_from_a_path_is_the_same(place: Workspace):
         for name in reversed(found.holds):
             own = np.where(found.holds[name], OBSTRUCTIONS.index(name), own)
         np.testing.assert_array_equal(own, np.asarray(code))
-        free = own == 0
-        np.testing.assert_allclose(found.path[free][:1], np.asarray(controls)[free][:1, :6], atol=0.05)
+        free, lead = own == 0, description.feed_forward()[:6]
+        commanded = found.path + lead * found.velocity
+        np.testing.assert_allclose(commanded[free], np.asarray(controls)[free, :6], atol=2e-3)
+
+
+@functools.partial(jax.jit, static_argnames="cell")
+def upward(depth: jax.Array, labels: jax.Array, *, cell: str = "max") -> tuple[jax.Array, jax.Array]:
+    """Return what the package makes of a depth image; NaN is none."""
+    points = heightmap.unproject(depth, heightmap.overhead_camera())
+    return project_upward(jnp.nan_to_num(points), labels, jnp.isfinite(depth), cell=cell)
 
 
 @pytest.mark.parametrize("cell", ["max", "second", "median"])
@@ -127,26 +140,24 @@ def test_projection_is_that_of_the_package(cell: str):
     depth[rng.random(depth.shape) < 0.3] = np.nan
     labels = rng.integers(0, 3, depth.shape).astype(np.uint8)
     maps = to_maps(depth[CROP.rows, CROP.columns], labels[CROP.rows, CROP.columns], camera=CAMERA, crop=CROP, cell=cell)
-    points = heightmap.unproject(jnp.asarray(depth), heightmap.overhead_camera())
-    valid = jnp.isfinite(jnp.asarray(depth))
-    height, wanted = project_upward(jnp.nan_to_num(points), jnp.asarray(labels), valid, cell=cell)
+    height, wanted = upward(jnp.asarray(depth), jnp.asarray(labels), cell=cell)
     off = np.abs(maps.height_m - np.asarray(height))
     assert (off <= 1e-5).mean() > 0.997, "but for pixels on the border of two cells"
     assert (maps.labels == np.asarray(wanted)).mean() > 0.997
 
 
 def test_the_robot_is_drawn_where_the_package_draws_it():
-    hulls = heightmap.robot_hulls(ROBOT, jnp.asarray(GOLDEN["joint_pos"][-1]))
-    depth, ids = jax.jit(lambda h: heightmap.render_pinhole(h, heightmap.overhead_camera()))(hulls)
+    def render(joint_pos: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return heightmap.render_pinhole(heightmap.robot_hulls(ROBOT, joint_pos), heightmap.overhead_camera())
+
+    depth, ids = jax.jit(render)(jnp.asarray(GOLDEN["joint_pos"][-1]))
     blank = np.full(CAMERA.shape, np.nan, np.float32)
     nothing = np.zeros(CAMERA.shape, np.uint8)
     joints = GOLDEN["joint_pos"][-1]
     about = {"camera": CAMERA, "crop": CROP, "body": BODY, "joint_pos": joints, "entry": BUNDLE.contract.grid}
     drawn = project(blank, nothing, **about)
-    points = heightmap.unproject(depth, heightmap.overhead_camera())
-    height, _ = project_upward(points, ids, ids > 0)
-    robot = drawn.labels == LABELS["robot"]
-    wanted = np.asarray(project_upward(points, ids, ids > 0)[1]) > 0
+    height, shown = upward(jnp.where(ids > 0, depth, jnp.nan), ids)
+    robot, wanted = drawn.labels == LABELS["robot"], np.asarray(shown) > 0
     assert wanted.sum() > 300 and (robot != wanted).sum() <= 0.02 * wanted.sum()
     both = robot & wanted
     assert (np.abs(drawn.height_m - np.asarray(height))[both] < 1e-3).mean() > 0.98
@@ -154,11 +165,11 @@ def test_the_robot_is_drawn_where_the_package_draws_it():
 
 def test_an_object_above_the_robot_is_not_painted_over():
     joints = GOLDEN["joint_pos"][-1]
-    high = np.full(CAMERA.shape, 0.5, np.float32)  # 0.5 m above the table everywhere
+    high = np.full(CAMERA.shape, 0.3, np.float32)  # 0.7 m above the table everywhere
     labels = np.full(CAMERA.shape, LABELS["target"], np.uint8)
     about = {"camera": CAMERA, "crop": CROP, "body": BODY, "joint_pos": joints, "entry": BUNDLE.contract.grid}
     maps = project(high, labels, **about)
-    assert (maps.labels == LABELS["target"]).mean() > 0.95
+    assert (maps.labels == LABELS["target"]).any() and not (maps.labels == LABELS["robot"]).any()
 
 
 @pytest.fixture(scope="module")
@@ -190,24 +201,16 @@ def test_pushes_are_the_golden_ones(decider: Decider):
 
 
 def test_allowed_pushes_are_those_of_the_primitive(decider: Decider):
-    from pregrasp_jax.task.push import make_push
-
-    push = make_push(ROBOT, TABLE, dataclasses.replace(heightmap_task()), max_distance=0.2)
+    push = make_push(ROBOT, TABLE, TaskConfig(), max_distance=0.2)
     own = allowed_pushes(BUNDLE.contract.action, decider.start())
     np.testing.assert_array_equal(own, np.asarray(push.mask(jax.tree.map(jnp.asarray, ROBOT.start))))
-
-
-def heightmap_task():
-    from pregrasp_jax.config import TaskConfig
-
-    return TaskConfig()
 
 
 def test_a_push_that_the_arm_cannot_make_is_passed_over(decider: Decider):
     best = decider.decide(golden_maps(0), decider.start(), joints_of(0)).push
     assert best is not None
     x, y = best.end.xy
-    walls = (Box(center=(float(x), float(y), 0.2), half_size=(0.01, 0.01, 0.2)),)
+    walls = (Box(center=(float(x), float(y), 0.2), half_size=(0.03, 0.08, 0.2)),)
     fenced = dataclasses.replace(decider, workspace=dataclasses.replace(TABLE, walls=walls))
     other = fenced.decide(golden_maps(0), decider.start(), joints_of(0))
     assert other.push is not None and other.push.action != best.action
@@ -257,7 +260,7 @@ def test_depth_is_metres_whatever_it_came_as():
         (steps, 1.0, "are these millimetres"),
         (metres[1:], None, "shape"),
         (np.full((48, 64), np.nan), None, "0% of it has a depth"),
-        (metres.astype(np.uint8), None, "uint8"),
+        (np.ones((48, 64), np.uint8), None, "uint8"),
         (metres.astype(complex), None, "complex"),
     ):
         with pytest.raises(ValueError, match=said):

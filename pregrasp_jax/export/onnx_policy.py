@@ -211,7 +211,9 @@ def _coordinates(graph: Graph, row: str, col: str, shape: tuple[int, int]) -> st
     columns = [cells[0].reshape(1, 1, -1, 1), cells[1].reshape(1, 1, 1, -1)]
     batch = graph("Shape", row, start=0, end=1)
     target = graph("Concat", batch, np.array([1, *lengths]), axis=0)
-    parts: list[str | np.ndarray] = [(2 * cell + 1) / np.float32(length) - 1 for cell, length in zip(columns, shape, strict=True)]
+    parts: list[str | np.ndarray] = [
+        (2 * cell + 1) / np.float32(length) - 1 for cell, length in zip(columns, shape, strict=True)
+    ]
     for origin, cell in zip((row, col), columns, strict=True):
         corner = graph("Reshape", graph.cast(origin, TensorProto.FLOAT), np.array([0, 1, 1, 1]))
         doubled = graph("Add", graph("Mul", graph("Add", corner, cell), _scalar(2.0)), _scalar(1.0))

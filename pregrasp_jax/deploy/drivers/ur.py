@@ -145,16 +145,20 @@ class UrArm:
         self._move_tool(np.concatenate([pose[:3] + up, pose[3:]]))
 
     def stop(self) -> None:
-        """Stop where it is."""
-        if self._control is not None:
+        """Stop where it is; a controller whose link is down has stopped by itself."""
+        if self._control is not None and self._is_up():
             self._control.stopL(_STOP)
 
     def close(self) -> None:
         """Stop the program on the controller and let go."""
-        for end in (self._control and self._control.stopScript, self._control and self._control.disconnect):
-            self._quietly(end)
+        if self._is_up():  # else there is nobody to tell, and the client would wait for ever
+            self._quietly(self._control and self._control.stopScript)
+            self._quietly(self._control and self._control.disconnect)
         self._quietly(self._receive and self._receive.disconnect)
         self._control = self._receive = None
+
+    def _is_up(self) -> bool:
+        return bool(self._control and self._control.isConnected() and self._receive and self._receive.isConnected())
 
     @staticmethod
     def _quietly(call: Any) -> None:
