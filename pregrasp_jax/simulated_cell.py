@@ -6,6 +6,8 @@ be run, and measured, without one.
 
 import dataclasses
 import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,12 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax import heightmap
-from pregrasp_jax.config import Config
+from pregrasp_jax.config import Config, from_dict
+from pregrasp_jax.deploy.build import make_decider, make_view
+from pregrasp_jax.deploy.bundle import Bundle
+from pregrasp_jax.deploy.cell import CameraSettings, Cell
 from pregrasp_jax.deploy.decision import Push
 from pregrasp_jax.deploy.devices import Frame
 from pregrasp_jax.deploy.files import masks_of_ids
+from pregrasp_jax.deploy.log import DecisionLog
+from pregrasp_jax.deploy.loop import Station
 from pregrasp_jax.deploy.masks import Masks, Target
-from pregrasp_jax.task.env import Env
+from pregrasp_jax.startup import prepare
+from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.task.primitive import Stroke
 from pregrasp_jax.types import REASONS, ROBOT_ID, EnvState, HandPose
 
@@ -117,10 +125,59 @@ class SimulatedCell:
         return min(apertures), max(apertures)
 
 
-def simulated_config(config: Config, *, object_set: Any, object_dir: str | None, sensor: str, scene: int) -> Config:
-    """Return the configuration of a simulated cell for the policy of a configuration."""
-    task = dataclasses.replace(config.task, camera="pinhole", sensor=sensor)
-    assets = dataclasses.replace(config.assets, object_set=object_set, object_dir=object_dir)
-    # As many scenes as `evaluate` packs by default, so that both meet the same ones.
-    scenes = dataclasses.replace(config.scene, test_scenes=max(200, scene + 1))
-    return dataclasses.replace(config, task=task, assets=assets, scene=scenes).validate()
+def make_programs(bundle: Bundle, cell: Cell) -> Programs:
+    """Return the environment that a policy was trained for, with the objects and the sensor of a cell.
+
+    Raises:
+        ValueError: something of it cannot be used.
+    """
+    prepare()
+    config, sim = from_dict(bundle.contract.training.config, Config), cell.sim
+    config = dataclasses.replace(
+        config,
+        task=dataclasses.replace(config.task, camera="pinhole", sensor=sim.sensor),
+        assets=dataclasses.replace(config.assets, object_set=sim.object_set, object_dir=sim.object_dir),
+        # As many scenes as `evaluate` packs by default, so that both meet the same ones.
+        scene=dataclasses.replace(config.scene, test_scenes=max(200, sim.scene + 1)),
+    )
+    return Programs(make_env(config.validate(), split="test"))
+
+
+def make_simulated_station(
+    bundle: Bundle,
+    cell: Cell,
+    *,
+    programs: Programs | None = None,
+    log: Path | None = None,
+    say: Callable[[str], None] = print,
+) -> Station:
+    """Return a station whose every device is simulated; its camera is the contract's, whatever the cell says.
+
+    Args:
+        bundle: the policy.
+        cell: which scene, objects and sensor.
+        programs: from `make_programs`, where they are at hand.
+        log: folder for decisions, None for none.
+        say: told what happens.
+
+    Raises:
+        ValueError: something cannot be used.
+    """
+    if cell.sim.scene < 0:
+        raise ValueError(f"sim.scene = {cell.sim.scene} is out of range; allowed is 0 and more")
+    decider = make_decider(bundle, cell)
+    scene = SimulatedCell(programs or make_programs(bundle, cell), cell.sim.scene)
+    view = make_view(dataclasses.replace(cell, camera=CameraSettings()), decider, Path(), nominal=True)
+    return Station(
+        decider=decider,
+        cell=cell.runtime.cell,
+        log=DecisionLog(log, bundle.contract) if log else None,
+        say=say,
+        camera=view.camera,
+        crop=view.crop,
+        source=scene,
+        segmenter=scene,
+        arm=scene,
+        gripper=scene,
+        target=scene.target,
+    )

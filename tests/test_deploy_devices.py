@@ -1,4 +1,4 @@
-"""Devices: poses and calibrations, the guard, the real UR client against a fake controller, the RG2 against a server."""
+"""Devices: poses, calibrations, the guard; the real UR client and the RG2 against what stands for them."""
 
 import asyncio
 import subprocess

@@ -43,7 +43,15 @@ def deploy(
         raise ValueError(f"--config is missing; allowed with --arm {arm} is a cell.yaml (docs/robot.md)")
     cell, folder = (Cell(), Path()) if config is None else (read_cell(config), config.parent)
     hand = gripper or ("sim" if arm == "sim" else "dry")
-    station = make_station(read_bundle(bundle), cell, folder, arm=arm, gripper=hand, log=log)
+    held = read_bundle(bundle)
+    if arm == "sim" and hand == "sim":
+        import pregrasp_jax.simulated_cell as simulated  # with JAX and MuJoCo
+
+        station = simulated.make_simulated_station(held, cell, log=log)
+    elif arm != "sim" and hand != "sim":
+        station = make_station(held, cell, folder, arm=arm, gripper=hand, log=log)
+    else:
+        raise ValueError(f"--arm {arm} with --gripper {hand}: a simulated cell has both; allowed is sim with sim")
     try:
         station.run(once=once)
     finally:

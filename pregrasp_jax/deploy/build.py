@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -24,8 +24,8 @@ from pregrasp_jax.deploy.projection import Crop, make_crop
 from pregrasp_jax.deploy.tabletop import TabletopSegmenter
 from pregrasp_jax.robot.robot_file import from_arrays
 
-ArmKind = Literal["dry", "sim", "ur"]
-GripperKind = Literal["dry", "sim", "modbus"]
+ArmKind = Literal["dry", "ur"]
+GripperKind = Literal["dry", "modbus"]
 Say = Callable[[str], None]
 
 
@@ -81,7 +81,7 @@ def make_station(
     log: Path | None = None,
     say: Say = print,
 ) -> Station:
-    """Return a station; real devices are connected to here.
+    """Return a station; real devices are connected to here. `simulated_cell` makes one that is simulated.
 
     Args:
         bundle: the policy.
@@ -96,13 +96,7 @@ def make_station(
         ValueError: something cannot be used.
         DeviceError: a device is not there or not ready.
     """
-    if (arm == "sim") != (gripper == "sim"):
-        raise ValueError(f"--arm {arm} with --gripper {gripper}: a simulated cell has both; allowed is sim with sim")
     decider = make_decider(bundle, cell)
-    writer = DecisionLog(log, bundle.contract) if log else None
-    common = {"decider": decider, "cell": cell.runtime.cell, "log": writer, "say": say}
-    if arm == "sim":
-        return _simulated(cell, folder, decider, common)
     view = make_view(cell, decider, folder)
     if not cell.camera.depth:
         raise ValueError("camera.depth is missing in cell.yaml; allowed is the file that the camera's driver writes")
@@ -110,7 +104,10 @@ def make_station(
     hand = _gripper(cell, gripper, say)
     try:
         return Station(
-            **common,
+            decider=decider,
+            cell=cell.runtime.cell,
+            log=DecisionLog(log, bundle.contract) if log else None,
+            say=say,
             camera=view.camera,
             crop=view.crop,
             source=source,
@@ -123,30 +120,6 @@ def make_station(
     except BaseException:
         hand.close()
         raise
-
-
-def _simulated(cell: Cell, folder: Path, decider: Decider, common: dict[str, Any]) -> Station:
-    """Return a station whose every device is a simulated cell."""
-    import pregrasp_jax  # noqa: F401  (before jax)
-
-    # isort: split
-    from pregrasp_jax.config import Config, from_dict
-    from pregrasp_jax.simulated_cell import Programs, SimulatedCell, simulated_config
-    from pregrasp_jax.startup import prepare
-    from pregrasp_jax.task.env import make_env
-
-    prepare()
-    config, sim = from_dict(decider.contract.training.config, Config), cell.sim
-    about = {"object_set": sim.object_set, "object_dir": sim.object_dir, "sensor": sim.sensor, "scene": sim.scene}
-    env = make_env(simulated_config(config, **about), split="test")
-    if not 0 <= sim.scene < len(env.scenes):
-        raise ValueError(f"sim.scene = {sim.scene} is out of range; allowed is 0 to {len(env.scenes) - 1}")
-    scene = SimulatedCell(Programs(env), sim.scene)
-    # The simulated camera is the contract's, whatever the file says of a real one.
-    standard = dataclasses.replace(cell, camera=type(cell.camera)())
-    view = make_view(standard, decider, folder, nominal=True)
-    devices = {"source": scene, "segmenter": scene, "arm": scene, "gripper": scene, "target": scene.target}
-    return Station(**common, camera=view.camera, crop=view.crop, **devices)
 
 
 def _arm(cell: Cell, decider: Decider, kind: ArmKind, say: Say) -> ArmDriver:
