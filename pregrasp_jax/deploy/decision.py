@@ -20,7 +20,7 @@ from pregrasp_jax.spaces.workspace import Box, Workspace
 DT = 0.02
 """s between poses along a push."""
 
-MAX_TRIED = 200
+MAX_TRIED = 1000
 """Best pushes that are tried before there is no reachable one."""
 
 
