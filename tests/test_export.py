@@ -52,10 +52,10 @@ def run(model: onnx.ModelProto, inputs: dict[str, np.ndarray]) -> np.ndarray:
 
 CASES = [
     ("compact", 1 / 32, True, True),
-    ("compact", 0.25, True, False),
+    pytest.param("compact", 0.25, True, False, marks=pytest.mark.slow),
     ("compact", 1 / 16, False, False),
     ("paper", 1 / 32, True, False),
-    ("paper", 1 / 16, False, True),
+    pytest.param("paper", 1 / 16, False, True, marks=pytest.mark.slow),
 ]
 
 

@@ -129,19 +129,26 @@ def test_masks_are_dropped_merged_and_eroded_but_never_the_target_or_the_robot(h
     assert set(np.unique(plain)) == {0, 1, 2, 4, ROBOT_ID}
     dropped = ids_of(hulls, target=1, drop=1.0)
     assert set(np.unique(dropped)) == {0, 2, ROBOT_ID}
-    eroded = ids_of(hulls, erode=3)
+    eroded = ids_of(hulls, erode=6)
     for label in (1, 2, 4):
         before, after = (plain == label).sum(), (eroded == label).sum()
         assert 0 < after < before and not ((eroded == label) & (plain != label)).any()
     assert (eroded == ROBOT_ID).sum() == (plain == ROBOT_ID).sum()
-    grown = ids_of(hulls, dilate=3)
-    assert (grown == 4).sum() > (plain == 4).sum()
     seen = set()
     for push in range(12):
         merged = ids_of(hulls, target=1, push=push, merge=1.0)
         assert (merged == 2).any(), "the target's mask stays"
         seen.add(frozenset(np.unique(merged).tolist()))
     assert frozenset({0, 2, 4, ROBOT_ID}) in seen, "its neighbour in slot 0 becomes part of it"
+
+
+def test_masks_grow_over_the_table_only():
+    labels = np.zeros((9, 9), np.uint8)
+    labels[4, 4], labels[4, 6] = 3, ROBOT_ID
+    grown = np.asarray(sensor._masks(jnp.asarray(labels), None, Sensor(dilate=1), KEY, jnp.int32(0)))  # pyright: ignore[reportArgumentType]
+    wanted = labels.copy()
+    wanted[3, 4] = wanted[5, 4] = wanted[4, 3] = wanted[4, 5] = 3
+    np.testing.assert_array_equal(grown, wanted)
 
 
 def test_the_same_episode_has_the_same_noise_whatever_else_is_on(hulls):
@@ -160,12 +167,13 @@ def test_the_same_episode_has_the_same_noise_whatever_else_is_on(hulls):
     assert all((data[0] != other).any() for other in data[2:])
 
 
+@pytest.mark.slow
 def test_the_robot_stays_exact_under_every_effect(hulls):
     height, ids = (np.asarray(x) for x in run(SENSORS["d435"], hulls, jnp.int32(0), jnp.int32(0)))
     plain_height, plain = (np.asarray(x) for x in run(Sensor(), hulls, jnp.int32(0), jnp.int32(0)))
     both = (ids == ROBOT_ID) & (plain == ROBOT_ID)
     assert both.sum() >= 0.97 * (plain == ROBOT_ID).sum()
-    assert (np.abs(height - plain_height)[both] < 1e-4).mean() > 0.97
+    assert (np.abs(height - plain_height)[both] < 1e-4).mean() > 0.9, "but where its sides come into view"
     assert np.abs(height - plain_height)[plain > 0].max() > 1e-3, "the others do not"
 
 
