@@ -112,7 +112,7 @@ def test_a_calibration_is_checked_against_the_table(tmp_path: Path, tilt: float,
     with Image.open(tmp_path / "check.png") as picture:
         colors = np.asarray(picture.convert("RGB"), int)
     middle, right = colors[250, 250], colors[250, -5]
-    assert middle.min() > 200 and (right.min() > 240) is (tilt == 0)
+    assert middle.min() > 200 and bool(right.min() > 240) == (tilt == 0)
 
 
 def test_the_python_of_the_page_runs(monkeypatch, capsys):
