@@ -112,8 +112,10 @@ class ReplayConfig:
     """Alpha of prioritized replay; 0 samples uniformly."""
     importance_exponent: float = 0.4
     """Beta at the start."""
-    importance_steps: int = 150_000
-    """Env steps over which beta rises linearly to 1."""
+    importance_steps: int | None = None
+    """Env steps over which beta rises linearly to 1; None takes `importance_fraction` of the run."""
+    importance_fraction: float = 5 / 6
+    """Share of the run over which beta rises."""
     hindsight: bool = True
     """Replay episodes that enclosed an obstacle with that obstacle as the target; False is the No-HER ablation."""
 
@@ -126,8 +128,10 @@ class LearnerConfig:
     """Adam step size."""
     final_learning_rate: float = 1e-4
     """Adam step size at the end of a linear decay."""
-    learning_rate_steps: int = 0
-    """Updates over which the step size decays; 0 keeps it."""
+    learning_rate_steps: int | None = None
+    """Updates over which the step size decays; 0 keeps it, None takes `learning_rate_fraction` of the run."""
+    learning_rate_fraction: float = 1.0
+    """Share of the run over which the step size decays."""
     discount: float = 0.5
     """Gamma."""
     polyak: float = 0.999
@@ -150,8 +154,10 @@ class ExplorationConfig:
     """Share of random actions at the first env step."""
     epsilon_end: float = 0.1
     """Share of random actions after the decay."""
-    epsilon_decay: int = 20_000
-    """Env steps over which epsilon falls linearly."""
+    epsilon_decay: int | None = None
+    """Env steps over which epsilon falls linearly; None takes `epsilon_fraction` of the run."""
+    epsilon_fraction: float = 1 / 9
+    """Share of the run over which epsilon falls."""
     guided: bool = True
     """Random actions aim at the target inside the half ring; False draws from all 20 000 (Random-Exp ablation)."""
     angle_std: float = 0.5
@@ -172,8 +178,12 @@ class TrainConfig:
     """Scenes stepped in parallel; with `mjx` on several devices a multiple of their number."""
     episodes: int = 45_000
     """Stop after this many episodes (the paper trains for 45 K) ..."""
+    env_steps: int = 0
+    """... or after this many env steps (pushes); 0 sets no limit ..."""
     minutes: float = 0.0
-    """... or after this many minutes of training time, resumed time included; 0 sets no limit."""
+    """... or after this many minutes of training time, resumed time included; 0 sets no limit. The limit is the length
+    that fractions of the run refer to: `env_steps` if given, else episodes of four pushes or the env steps that fit
+    into the minutes, whichever is less. These are settled once, by the speed after the warm-up."""
     checkpoint_minutes: float = 5.0
     """Time between checkpoints: the most that a crash can lose."""
     evaluate_every: int = 5_000
@@ -280,9 +290,11 @@ _RANGES: dict[str, tuple[float, float]] = {
     "replay.priority_exponent": (0.0, 1.0),
     "replay.importance_exponent": (0.0, 1.0),
     "replay.importance_steps": (1, 1_000_000_000),
+    "replay.importance_fraction": (0.0, 1.0),
     "learner.learning_rate": (1e-7, 1.0),
     "learner.final_learning_rate": (0.0, 1.0),
     "learner.learning_rate_steps": (0, 1_000_000_000),
+    "learner.learning_rate_fraction": (0.0, 1.0),
     "learner.discount": (0.0, 0.999),
     "learner.polyak": (0.0, 1.0),
     "learner.huber_delta": (1e-4, 100.0),
@@ -292,12 +304,14 @@ _RANGES: dict[str, tuple[float, float]] = {
     "exploration.epsilon_start": (0.0, 1.0),
     "exploration.epsilon_end": (0.0, 1.0),
     "exploration.epsilon_decay": (1, 1_000_000_000),
+    "exploration.epsilon_fraction": (0.0, 1.0),
     "exploration.angle_std": (0.0, 10.0),
     "exploration.open_probability": (0.0, 1.0),
     "exploration.branches": (0, 64),
     "exploration.branch_temperature": (1e-3, 100.0),
     "train.num_envs": (1, 65_536),
     "train.episodes": (1, 1_000_000_000),
+    "train.env_steps": (0, 1_000_000_000),
     "train.minutes": (0.0, 1e6),
     "train.checkpoint_minutes": (0.0, 1e6),
     "train.evaluate_every": (0, 1_000_000_000),
@@ -308,16 +322,16 @@ _RANGES: dict[str, tuple[float, float]] = {
 _CPU = Config(
     scene=SceneConfig(validation_scenes=100),
     network=NetworkConfig(architecture="compact", width=0.25, initial_bias=0.5, mirror=True),
-    replay=ReplayConfig(capacity=100_000, importance_steps=50_000),
+    replay=ReplayConfig(capacity=100_000, importance_fraction=0.8),
     learner=LearnerConfig(
         learning_rate=1e-3,
         final_learning_rate=2e-5,
-        learning_rate_steps=100_000,
+        learning_rate_fraction=0.8,
         polyak=0.995,
         huber_delta=1.0,
         updates_per_step=2.0,
     ),
-    exploration=ExplorationConfig(epsilon_decay=10_000, branches=3),
+    exploration=ExplorationConfig(epsilon_fraction=0.16, branches=3),
     train=TrainConfig(num_envs=16, episodes=25_000, minutes=150.0, evaluate_every=2_500),
 )
 
@@ -326,16 +340,16 @@ PRESETS: dict[str, Config] = {
         scene=SceneConfig(train_scenes=4, validation_scenes=2, test_scenes=2),
         network=NetworkConfig(width=0.0625),
         replay=ReplayConfig(capacity=256, importance_steps=200),
-        learner=LearnerConfig(batch_size=4, warmup=8, updates_per_step=0.5),
+        learner=LearnerConfig(batch_size=4, warmup=8, updates_per_step=0.5, learning_rate_steps=0),
         exploration=ExplorationConfig(epsilon_decay=64),
         train=TrainConfig(num_envs=2, episodes=1_000_000, minutes=1.0, evaluate_every=0, log_every=2),
     ),
     "demo": dataclasses.replace(
         _CPU,
         scene=SceneConfig(train_scenes=64, validation_scenes=10, test_scenes=50),
-        replay=ReplayConfig(capacity=10_000, importance_steps=2_000),
-        learner=dataclasses.replace(_CPU.learner, final_learning_rate=1e-4, learning_rate_steps=4_000),
-        exploration=dataclasses.replace(_CPU.exploration, epsilon_decay=2_000),
+        replay=ReplayConfig(capacity=10_000, importance_fraction=1.0),
+        learner=dataclasses.replace(_CPU.learner, final_learning_rate=1e-4, learning_rate_fraction=1.0),
+        exploration=dataclasses.replace(_CPU.exploration, epsilon_fraction=1.0),
         train=TrainConfig(num_envs=16, episodes=2_000, minutes=5.0, evaluate_every=0),
     ),
     "cpu": _CPU,

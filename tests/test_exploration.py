@@ -129,8 +129,8 @@ def test_linear_schedule(step, value):
 
 
 def test_the_warm_up_only_explores():
-    config = ExplorationConfig(epsilon_start=0.5, epsilon_end=0.1, epsilon_decay=100)
-    values = [float(epsilon_at(step, config, warmup=50)) for step in (0, 49, 50, 100)]
+    config = ExplorationConfig(epsilon_start=0.5, epsilon_end=0.1)
+    values = [float(epsilon_at(step, config, warmup=50, decay=100)) for step in (0, 49, 50, 100)]
     assert values == pytest.approx([1.0, 1.0, 0.3, 0.1])
 
 

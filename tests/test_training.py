@@ -247,7 +247,7 @@ def test_the_step_size_decays_linearly_and_stays():
     steady = dataclasses.replace(PRESETS["ci"].learner, learning_rate=0.1, learning_rate_steps=0)
     decaying = dataclasses.replace(steady, final_learning_rate=0.02, learning_rate_steps=4)
     for config, expected in ((steady, [0.1] * 7), (decaying, [0.1, 0.08, 0.06, 0.04, 0.02, 0.02, 0.02])):
-        optimizer = learn.make_optimizer(config)
+        optimizer = learn.make_optimizer(config, config.learning_rate_steps)
         state, sizes = optimizer.init(jnp.float32(0)), []
         for _ in expected:
             step, state = optimizer.update(jnp.float32(3), state)
@@ -309,8 +309,8 @@ def test_a_push_is_traced_once_for_shapes_start_and_compilation_and_its_overflow
     state = jax.jit(built.init)(jax.random.key(0))
     compiled = built.compile(state)
     params = state.learning.learner.params
-    actors, _ = compiled.collect(state.actors, params)
-    actors, _ = compiled.collect(actors, params)
+    actors, _ = compiled.collect(state.actors, params, built.pace)
+    actors, _ = compiled.collect(actors, params, built.pace)
     assert len(env.traces) == 1
     assert collect.metrics(actors.tally, built.successes)["physics/overflows"] == 2 * config.train.num_envs
 

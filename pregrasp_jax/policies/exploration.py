@@ -15,7 +15,9 @@ _MIN_ANGLE_STD = 1e-3
 """rad; an `angle_std` of 0 means the direction nearest to the target, not a division by zero."""
 
 
-def linear_schedule(step: jax.Array | int, *, start: float, end: float, steps: int) -> jax.Array:
+def linear_schedule(
+    step: jax.Array | int, *, start: float, end: float, steps: jax.Array | np.floating | float
+) -> jax.Array:
     """Return the value () float32 that moves linearly from `start` at step 0 to `end` at `steps`, then stays."""
     return jnp.float32(start) + jnp.clip(jnp.float32(step) / steps, 0.0, 1.0) * (end - start)
 

@@ -23,6 +23,7 @@ from pregrasp_jax.task.primitive import Plan, Primitive
 from pregrasp_jax.task.rules import Rules
 from pregrasp_jax.task.stages import Stages, make_stages
 from pregrasp_jax.training.mishap import Mishap, no_mishap
+from pregrasp_jax.training.schedules import Pace
 from pregrasp_jax.training.sharding import VmapFn
 from pregrasp_jax.types import REASONS, EnvState, HandPose, StepResult
 
@@ -166,7 +167,7 @@ def make_collect(
     warmup: int,
     vmap: VmapFn = jax.vmap,
 ) -> Stages:
-    """Return the function ``(actors, params) -> (actors, experience)``: push in every scene, reset those that ended.
+    """Return the function ``(actors, params, pace) -> (actors, experience)``: push everywhere, reset what has ended.
 
     Args:
         env: the scenes.
@@ -203,11 +204,11 @@ def make_collect(
         promising = jnp.concatenate([greedy_action(q, mask)[None], drawn])
         return jnp.where(random, exploratory, promising), random
 
-    def decide(actors: Actors, params: Params) -> tuple[Any, Plan, Any]:
+    def decide(actors: Actors, params: Params, pace: Pace) -> tuple[Any, Plan, Any]:
         states = actors.env_states
         num_envs = states.num_pushes.shape[0]
         key, action_key, reset_key = jax.random.split(actors.key, 3)
-        epsilon = epsilon_at(actors.tally.env_steps, config, warmup=warmup)
+        epsilon = epsilon_at(actors.tally.env_steps, config, warmup=warmup, decay=pace.epsilon_decay)
         q = q_function.apply(params, jax.vmap(q_function.input_fn)(states.obs, states.scene.target))
         keys = jax.random.split(action_key, num_envs)
         actions, random = jax.vmap(act, (0, 0, 0, None))(keys, states, q, epsilon)
@@ -245,11 +246,18 @@ def _with_branches(states: EnvState, config: ExplorationConfig) -> EnvState:
     return jax.tree.map(lambda leaf: jnp.concatenate([leaf] * (1 + config.branches)), states)
 
 
-def epsilon_at(env_steps: jax.Array | int, config: ExplorationConfig, *, warmup: int) -> jax.Array:
-    """Return the share of random actions () after `env_steps` pushes; 1 during the warm-up."""
-    decayed = exploration.linear_schedule(
-        env_steps, start=config.epsilon_start, end=config.epsilon_end, steps=config.epsilon_decay
-    )
+def epsilon_at(
+    env_steps: jax.Array | int, config: ExplorationConfig, *, warmup: int, decay: jax.Array | np.floating | float
+) -> jax.Array:
+    """Return the share of random actions () after `env_steps` pushes; 1 during the warm-up.
+
+    Args:
+        env_steps: so far.
+        config: where it begins and ends.
+        warmup: env steps of pure exploration.
+        decay: env steps after which it stays, see `schedules`.
+    """
+    decayed = exploration.linear_schedule(env_steps, start=config.epsilon_start, end=config.epsilon_end, steps=decay)
     return jnp.where(env_steps < warmup, 1.0, decayed)
 
 
