@@ -387,12 +387,12 @@ def from_dict(values: Mapping[str, Any], cls: type = Config, prefix: str = "") -
 
 def _checked(value: Any, hint: Any, key: str) -> Any:
     """Return `value` if it is of type `hint` (an int passes for a float)."""
-    origin = typing.get_origin(hint)
-    if origin is Literal:
-        if value not in typing.get_args(hint):
-            raise ValueError(f"{key} = {value!r} is unknown; allowed: {', '.join(typing.get_args(hint))}")
+    allowed = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+    words = [word for option in allowed if typing.get_origin(option) is Literal for word in typing.get_args(option)]
+    if words and (value is not None or type(None) not in allowed):
+        if value not in words:
+            raise ValueError(f"{key} = {value!r} is unknown; allowed: {', '.join(words)}")
         return value
-    allowed = typing.get_args(hint) if origin in (typing.Union, types.UnionType) else (hint,)
     if float in allowed and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(value) not in allowed:

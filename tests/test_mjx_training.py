@@ -161,7 +161,7 @@ def test_twenty_pushes_on_four_packed_scenes_with_automatic_resets(full_env):
     actors, params = state.actors, state.learning.learner.params
     sizes = []
     for _ in range(20):
-        actors, _ = push(actors, params)
+        actors, _ = push(actors, params, built.pace)
         sizes.append(sum(x.nbytes for x in jax.live_arrays()))
     report = collect.metrics(actors.tally, SUCCESSES)
     assert report["env_steps"] == 80 and report["episodes"] > 4

@@ -63,7 +63,7 @@ def test_branches_are_learned_from_and_change_nothing_else():
     params, branch_actions = state.learning.learner.params, []
     for step in range(1, 9):
         before = state.actors
-        actors, experience = collect_once(before, params)
+        actors, experience = collect_once(before, params, built.pace)
         learning = remember(state.learning, experience)
         state = state.replace(actors=actors, learning=learning)
         steps = experience.steps
@@ -336,7 +336,7 @@ def test_a_scene_that_ended_starts_anew_and_the_others_go_on():
     collect_fn, params = jax.jit(built.collect), jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), params)
     for _ in range(12):
         before = actors
-        actors, experience = collect_fn(actors, params)
+        actors, experience = collect_fn(actors, params, built.pace)
         steps = experience.steps
         ended = np.asarray(steps.terminated | steps.truncated)
         pushed, _ = jax.vmap(env.step)(before.env_states, steps.action)
@@ -360,5 +360,5 @@ def test_the_learner_measures_what_the_report_prints(monkeypatch):
     monkeypatch.setattr(learner, "update", spy)
     built = make_program(make_config())
     shapes = built.shapes()
-    jax.eval_shape(built.update, shapes.learning, jnp.float32(0))
+    jax.eval_shape(built.update, shapes.learning, jnp.float32(0), built.pace)
     assert measured == set(learn.METRICS)

@@ -1,6 +1,5 @@
 """The program `pregrasp-jax`: its subcommands by name, each of which is imported when it is asked for."""
 
-import functools
 import pkgutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +9,7 @@ from typing import Any
 import tyro
 
 import pregrasp_jax
-from pregrasp_jax.cli.command_line import INTERRUPTED, one_line_errors, parse
+from pregrasp_jax.cli.command_line import INTERRUPTED, deferred, one_line_errors, parse
 
 PROGRAM = "pregrasp-jax"
 
@@ -50,6 +49,7 @@ COMMANDS = {
     "report": Command("Write the page of a run.", "pregrasp_jax.cli.report:report"),
     "scenes": Command("Describe and draw a bank of packed scenes.", "pregrasp_jax.cli.commands:scenes"),
     "show": Command("Draw one decision of a policy.", "pregrasp_jax.cli.commands:show"),
+    "sweep": Command("Train many settings, and find the best.", "pregrasp_jax.cli.sweep:commands", nested=True),
     "train": Command("Train a policy, or continue a run.", "pregrasp_jax.cli.train:sessions", nested=True),
 }
 
@@ -88,7 +88,7 @@ def _bind(command: Command, options: list[str], prog: str) -> Callable[[], int |
         return _parse_nested(target(options), options, prog, command.summary)
     if command.aliases:
         options = _spelled_out(options, pkgutil.resolve_name(command.aliases))
-    return parse(lambda: tyro.cli(_deferred(target), prog=prog, args=options, config=(tyro.conf.FlagConversionOff,)))
+    return parse(lambda: tyro.cli(deferred(target), prog=prog, args=options, config=(tyro.conf.FlagConversionOff,)))
 
 
 def _spelled_out(options: list[str], aliases: Mapping[str, str]) -> list[str]:
@@ -106,16 +106,6 @@ def _parse_nested(
             parsers, prog=prog, args=arguments, description=description, config=(tyro.conf.FlagConversionOff,)
         )
     )
-
-
-def _deferred(function: Callable[..., int | None]) -> Callable[..., Callable[[], int | None]]:
-    """Return a function with the same options that returns the call instead of making it."""
-
-    @functools.wraps(function)
-    def bind(*args: object, **options: object) -> Callable[[], int | None]:
-        return functools.partial(function, *args, **options)
-
-    return bind
 
 
 def _summary(command: Command) -> Callable[[], Any]:

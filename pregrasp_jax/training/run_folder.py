@@ -5,7 +5,6 @@ physics diverged), run.lock.
 """
 
 import datetime
-import errno
 import fcntl
 import json
 import os
@@ -155,12 +154,7 @@ class RunFolder:
         Raises:
             OSError: the disk is full.
         """
-        data = (json.dumps(row, allow_nan=False) + "\n").encode()
-        with self.metrics.open("ab", buffering=0) as file:
-            length = file.tell()
-            if file.write(data) < len(data):  # what a full disk does at first; only the next write raises
-                file.truncate(length)
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), file.name)
+        io.append_json_line(self.metrics, row)
         if self._event_log:
             self._event_log.append(row)
 
