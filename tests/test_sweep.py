@@ -24,7 +24,7 @@ from pregrasp_jax.sweep.table import format_table, make_table
 from pregrasp_jax.sweep.worker import BUSY, UNWRITTEN, Worker, environment, measured
 
 STUB = Path(__file__).parent / "stub_trainer.py"
-LENGTH = 400
+LENGTH, LONG = 400, 1500
 
 
 def make_spec(**keys: Any) -> Spec:
@@ -99,6 +99,7 @@ def halved(tmp_path_factory) -> tuple[SweepFolder, Spec, list[str]]:
     spec = make_spec(
         parameters={"task.r_out": {"values": [0.15, 0.2]}, "learner.learning_rate": {"values": [1e-3, 2e-3]}},
         seeds=[0, 1],
+        set={"train.env_steps": LONG, "train.minutes": 0, "train.evaluate_every": 100},
         stop={"method": "halving", "rungs": [100], "keep": 0.25},
         final={"seeds": [10, 11], "episodes": 20},
     )
@@ -115,11 +116,9 @@ def test_halving_stops_by_signal_and_goes_on_by_resume(halved):
     assert Counter(words[known.trial.id] for known in main) == {"dropped": 6, "done": 2}
     for known in main:
         kept = words[known.trial.id] == "done"
-        assert 100 in known.scores and (known.env_steps == LENGTH if kept else 100 <= known.env_steps < LENGTH)
+        assert 100 in known.scores and (known.env_steps == LONG if kept else 100 <= known.env_steps < LONG)
         assert len(sessions(folder, known)) == (2 if kept else 1)
-        assert kept == (
-            known.trial.settings["task.r_out"] == 0.15 and known.trial.settings["learner.learning_rate"] == 1e-3
-        )
+        assert kept == (dict(known.trial.varied) == {"task.r_out": 0.15, "learner.learning_rate": 1e-3})
 
 
 def test_the_winner_is_trained_again_with_fresh_seeds_and_tested(halved):
@@ -146,7 +145,7 @@ def test_the_table_ranks_and_says_what_is_noise(halved):
     assert best.varied == {"task.r_out": 0.15, "learner.learning_rate": 1e-3} and best.word == "done"
     assert [row.word for row in others] == ["dropped"] * 3
     text = format_table(table)
-    assert "Differences within" in text and text.splitlines()[0].startswith("rank  setting")
+    assert "Differences within" in text and text.splitlines()[0].split()[:2] == ["rank", "setting"]
     assert "final" in text and "test: test" in text
     assert any("2 of 8 trials done" in line or "dropped" in line for line in said)
 
@@ -328,9 +327,7 @@ def test_a_spec_may_be_edited_where_it_changes_no_trial(tmp_path):
     file.write_text(file.read_text() + "final: {seeds: [5]}\n")
     assert folder.spec().final.seeds == (5,)
     file.write_text(file.read_text().replace("preset: ci", "preset: cpu"))
-    with pytest.raises(
-        ValueError, match=r"preset is not what the sweep began with; allowed to change: resources, slurm"
-    ):
+    with pytest.raises(ValueError, match=r"preset is not what the sweep began with; allowed to change: "):
         folder.spec()
     with pytest.raises(ValueError, match="already holds a sweep; go on with `pregrasp-jax sweep resume"):
         SweepFolder.create(tmp_path / "sweep", spec)

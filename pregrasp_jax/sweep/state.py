@@ -89,8 +89,7 @@ def _end(state: TrialState, event: Record) -> None:
     state.env_steps = max(state.env_steps, event.get("env_steps") or 0)
     if event.get("score") is not None:
         state.score, state.motions = event["score"], event.get("motions")
-    if event["outcome"] == RUNG:
-        state.scores[event["rung"]] = event["score"]
+    state.scores |= {int(rung): score for rung, score in event.get("scores", {}).items()}
 
 
 def next_jobs(spec: Spec, states: Sequence[TrialState]) -> list[Job]:

@@ -31,6 +31,9 @@ UNWRITTEN = 74
 PATIENCE = 2.0
 """s in which a lock may become free: to ask whether a trial is running takes it for an instant."""
 
+ATTEMPTS = 10
+"""Times that a worker tries to write down how it ended, half a minute in all, before the driver hears of it."""
+
 POLL = 0.2
 """s between two looks at a training."""
 
@@ -90,7 +93,10 @@ class Worker:
         ending = self._work()
         event = {"event": "ended", "id": self.trial.id, "rung": self.rung, "outcome": ending.outcome}
         event |= {"exit_code": ending.code, "message": ending.message, "seconds": round(time.monotonic() - start, 1)}
-        written = self._record(event | measured(read_metrics(self.run_dir), self.spec.stop.metric, self.rung))
+        rows, metric = read_metrics(self.run_dir), self.spec.stop.metric
+        at = {str(rung): measured(rows, metric, rung)["score"] for rung in state.rungs(self.spec)}
+        known = {"scores": {rung: score for rung, score in at.items() if score is not None}}
+        written = self._record(event | measured(rows, metric, None) | known)
         return _EXIT_CODES[ending.outcome] if written else UNWRITTEN
 
     def _work(self) -> _Ending:
@@ -156,7 +162,7 @@ class Worker:
 
     def _record(self, event: Mapping[str, Any]) -> bool:
         """Write an event down; a full disk is given half a minute. Return whether it was written."""
-        for attempt in range(10):
+        for attempt in range(ATTEMPTS):
             try:
                 self.folder.append(event)
                 return True
