@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,13 +13,16 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from pregrasp_jax import yaml_file
 from pregrasp_jax.sweep import driver, state
 from pregrasp_jax.sweep.driver import Driver
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.launchers import Launcher, LocalLauncher, Slot
+from pregrasp_jax.sweep.page import write_page
 from pregrasp_jax.sweep.spec import Spec, spec_from
 from pregrasp_jax.sweep.state import Job, TrialState
 from pregrasp_jax.sweep.table import format_table, make_table
@@ -148,6 +153,37 @@ def test_the_table_ranks_and_says_what_is_noise(halved):
     assert "Differences within" in text and text.splitlines()[0].split()[:2] == ["rank", "setting"]
     assert "final" in text and "test: test" in text
     assert any("2 of 8 trials done" in line or "dropped" in line for line in said)
+
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+def test_a_browser_shows_the_page_and_finds_nothing_wrong_with_it(halved, tmp_path):
+    assert CHROMIUM
+    folder, spec, _ = halved
+    page, picture = write_page(folder, spec, tmp_path / "page.html"), tmp_path / "page.png"
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--enable-logging=stderr", "--v=0"]
+    options += [f"--screenshot={picture}", "--window-size=1200,2600", f"--user-data-dir={tmp_path / 'profile'}"]
+    shown = subprocess.run([CHROMIUM, *options, page.as_uri()], capture_output=True, text=True, timeout=60, check=True)
+    assert "CONSOLE" not in shown.stderr
+    dumped = subprocess.run(
+        [CHROMIUM, *options[:3], f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page.as_uri()],
+        capture_output=True, text=True, timeout=60, check=True,
+    ).stdout  # fmt: skip
+    assert dumped.count('class="curve s0 wide"') >= 1 and "Differences within" in dumped
+    image = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3)
+    assert len(np.unique(image, axis=0)) > 50, "there is something to see"
+
+
+def test_the_page_says_what_to_type_and_draws_every_setting(halved, tmp_path):
+    folder, spec, _ = halved
+    text = write_page(folder, spec, tmp_path / "page.html").read_text()
+    command = "pregrasp-jax train ci --run-dir runs/NAME --seed 0 --train.env-steps 1500 --train.minutes 0"
+    assert command in text.replace("<wbr>", "") and "--task.r-out 0.15" in text.replace("<wbr>", "")
+    lines = re.findall(r'<path d="M[^"]*" class="curve (s0 wide|faint)"><title>([^<]*)', text)
+    assert len(lines) == 4 and [kind for kind, _ in lines].count("s0 wide") == 1
+    assert "http" not in re.sub(r"<meta[^>]*>", "", text)
 
 
 def test_a_killed_worker_stops_its_training_and_the_next_goes_on(tmp_path):

@@ -44,12 +44,12 @@ def learning_figures(run: RunRecord) -> list[Markup]:
         "random pushes, measured": run.curve("train/explored"),
     }
     figures = [
-        _figure("Success against pushes", _success(run), x_label=_STEPS, **percent),
-        _figure("Success against time", _success(run, **time), x_label=f"training time ({unit})", **percent),
-        _figure("Loss", _lines({"loss per update": run.curve("train/loss")}), x_label=_STEPS, y_label="Huber loss"),
-        _figure("Q-values", _lines(values), x_label=_STEPS, y_label="Q, discounted reward"),
-        _figure("Exploration", _lines(exploring), x_label=_STEPS, y_label="share of pushes", y_limits=(0.0, 1.0)),
-        _figure("Motions", _motions(run), x_label=_STEPS, y_label="pushes per episode"),
+        figure("Success against pushes", _success(run), x_label=_STEPS, **percent),
+        figure("Success against time", _success(run, **time), x_label=f"training time ({unit})", **percent),
+        figure("Loss", _lines({"loss per update": run.curve("train/loss")}), x_label=_STEPS, y_label="Huber loss"),
+        figure("Q-values", _lines(values), x_label=_STEPS, y_label="Q, discounted reward"),
+        figure("Exploration", _lines(exploring), x_label=_STEPS, y_label="share of pushes", y_limits=(0.0, 1.0)),
+        figure("Motions", _motions(run), x_label=_STEPS, y_label="pushes per episode"),
     ]
     return [figure for figure in figures if figure]
 
@@ -85,10 +85,10 @@ def time_figures(run: RunRecord) -> list[Markup]:
     if total := sum(known.values()):
         items = [(phase, 100 * s / total, f"{_percent(s / total)}, {duration(s)}") for phase, s in known.items()]
         title = f"Time by phase, {duration(total)} in all"
-        figures.append(_boxed(title, bar_chart(items, title=title, x_label="share of the time (%)", x_limit=100.0)))
+        figures.append(boxed(title, bar_chart(items, title=title, x_label="share of the time (%)", x_limit=100.0)))
     speed = _lines({"pushes": run.curve("time/env_steps_per_second")})
     figures.append(
-        _figure("Speed, learning and evaluation included", speed, x_label=_STEPS, y_label="pushes per second")
+        figure("Speed, learning and evaluation included", speed, x_label=_STEPS, y_label="pushes per second")
     )
     return [figure for figure in figures if figure]
 
@@ -134,25 +134,25 @@ def _lines(curves: dict[str, list[Point]]) -> list[Series]:
     return [Series(label=label, points=points) for label, points in curves.items()]
 
 
-def _figure(title: str, series: Sequence[Series], **axes: Any) -> Markup:
+def figure(title: str, series: Sequence[Series], **axes: Any) -> Markup:
     """Return a chart with its legend, nothing if there is no point to draw."""
     if not any(line.points for line in series):
         return Markup("")
     keys = [
-        element("span", element("i", class_=f"key s{index}", aria_hidden="true"), line.label)
+        element("span", element("i", class_=f"key {line.color(index)}", aria_hidden="true"), line.label)
         for index, line in enumerate(series)
-        if line.points
+        if line.points and line.label
     ]
-    return _boxed(title, line_chart(series, title=title, **axes), element("p", *keys, class_="legend"))
+    return boxed(title, line_chart(series, title=title, **axes), element("p", *keys, class_="legend"))
 
 
 def _reasons(title: str, failures: Counter[str], total: int) -> Markup:
     found = [(reason, count) for reason, count in failures.most_common() if count]
     if not found:
-        return _boxed(title, element("p", "No episode failed."))
+        return boxed(title, element("p", "No episode failed."))
     items = [(_words(reason), 100 * count / total, f"{_percent(count / total)} ({count})") for reason, count in found]
     limit = max(10.0, 10 * -(-max(value for _, value, _ in items) // 10))
-    return _boxed(title, bar_chart(items, title=title, x_label="share of the episodes (%)", x_limit=limit))
+    return boxed(title, bar_chart(items, title=title, x_label="share of the episodes (%)", x_limit=limit))
 
 
 def _words(reason: str) -> str:
@@ -163,7 +163,8 @@ def _percent(share: float) -> str:
     return f"{100 * share:.{0 if share == 0 or share >= 0.01 else 1}f} %"
 
 
-def _boxed(title: str, *content: Markup) -> Markup:
+def boxed(title: str, *content: Markup) -> Markup:
+    """Return content in a box with a title."""
     return element("figure", element("figcaption", title), join(content), class_="chart")
 
 
