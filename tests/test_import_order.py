@@ -25,6 +25,7 @@ ORDER = [
     ["evaluation", "gymnasium"],
     ["training"],
     ["report"],
+    ["sweep"],
     ["cli"],
     ["__main__"],
 ]

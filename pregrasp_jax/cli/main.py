@@ -47,6 +47,7 @@ COMMANDS = {
     ),
     "replay-dump": Command("Repeat a push on which the physics diverged.", "pregrasp_jax.cli.replay:replay_dump"),
     "report": Command("Write the page of a run.", "pregrasp_jax.cli.report:report"),
+    "reproduce": Command("Make a table or figure of the paper.", "pregrasp_jax.cli.reproduce:reproduce"),
     "scenes": Command("Describe and draw a bank of packed scenes.", "pregrasp_jax.cli.commands:scenes"),
     "show": Command("Draw one decision of a policy.", "pregrasp_jax.cli.commands:show"),
     "sweep": Command("Train many settings, and find the best.", "pregrasp_jax.cli.sweep:commands", nested=True),

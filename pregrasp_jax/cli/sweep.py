@@ -51,6 +51,9 @@ def start(
     for line in describe(read, launcher=launcher, parallel=parallel):
         print(line, flush=True)
     if dry_run:
+        from pregrasp_jax.sweep.names import check_names
+
+        check_names(read)
         return 0
     return drive(SweepFolder.create(dir, read), read, launcher=launcher, parallel=parallel)
 

@@ -27,9 +27,8 @@ def parallel_coordinates(table: Table) -> Markup:
     names = list(dict.fromkeys(name for row in rows for name in row.varied))
     if not rows or not names:
         return Markup("")
-    axes = [_Axis([row.varied.get(name) for row in rows]) for name in names] + [
-        _Axis([row.score for row in rows], ends=True)
-    ]
+    axes = [_Axis([row.varied.get(name) for row in rows]) for name in names]
+    axes.append(_Axis([row.score for row in rows], ends=True))
     step = (WIDTH - 2 * SIDE) / (len(axes) - 1)
     xs = [SIDE + step * i for i in range(len(axes))]
     lines = [_setting_line(row, names, axes, xs, best=row is rows[0]) for row in reversed(rows)]
