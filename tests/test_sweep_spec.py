@@ -1,6 +1,8 @@
 """What is refused before a sweep starts, in one line; which settings there are; what becomes of them, as a function."""
 
 import random
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -249,3 +251,12 @@ def test_cores_memory_and_gpus_are_shared_out(monkeypatch):
     ):
         with pytest.raises(ValueError, match=said):
             shared(**options)
+
+
+def test_the_sweep_of_the_docs_can_be_started(tmp_path):
+    text = (Path(__file__).parent.parent / "docs" / "sweeps.md").read_text()
+    (code,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "spec.yaml").write_text(code)
+    spec = read_spec(tmp_path / "spec.yaml")
+    checks.check(spec)
+    assert {key for key in spec.__dataclass_fields__ if f"`{key}`" in text} == set(spec.__dataclass_fields__)
