@@ -66,7 +66,8 @@ def test_pairing_by_scene_narrows_the_interval_of_a_difference():
     b = np.stack([~hard & (generator.random(200) < 0.90) for _ in range(3)])
     found = aggregates.compare_settings(outcomes(a), outcomes(b))
     alone = [aggregates.interval(outcomes(x)) for x in (a, b)]
-    unpaired = np.hypot(*((high - low) / 2 for low, high in alone))
+    (low_a, high_a), (low_b, high_b) = alone
+    unpaired = np.hypot((high_a - low_a) / 2, (high_b - low_b) / 2)
     assert found.half_width < 0.6 * unpaired
     assert found.difference == pytest.approx(a.mean() - b.mean())
     opposite = aggregates.compare_settings(outcomes(b), outcomes(a))

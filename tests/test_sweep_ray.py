@@ -50,7 +50,7 @@ def test_a_sweep_is_pruned_survives_crashes_and_a_lost_worker_and_goes_on(cluste
                 command = ["sh", "-c", "kill -9 $PPID"]  # the process of Ray's task, as when a node goes
             return start.remote(command)
 
-    launcher._start = LosesOne
+    launcher._start = LosesOne  # pyright: ignore[reportAttributeAccessIssue]
     assert drive(folder, spec, launcher) == 0
     states = folder.states()
     words = driver.status(spec, states)

@@ -234,9 +234,9 @@ def test_cores_memory_and_gpus_are_shared_out(monkeypatch):
     monkeypatch.setattr(launchers, "_gpus", lambda: ["0", "1"])
     monkeypatch.setattr(launchers, "free_memory", lambda: int(10e9))
 
-    def shared(parallel: int | None = None, memory: float = 1e9, **resources: Any) -> list[tuple[Any, Any]]:
+    def shared(parallel: Any = None, memory: float = 1e9, **resources: Any) -> list[launchers.Slot]:
         spec = spec_from(changed(resources=resources))
-        return [tuple(slot) for slot in launchers.share_out(spec, parallel=parallel, memory=memory)]
+        return launchers.share_out(spec, parallel=parallel, memory=memory)
 
     assert shared(cores=2) == [((3, 4), ()), ((5, 8), ())]
     assert shared(cores=1, memory=4e9) == [((3,), ()), ((4,), ())]

@@ -14,7 +14,7 @@ from pregrasp_jax.sweep.driver import Driver
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.launchers import Launcher, LocalLauncher, share_out
 from pregrasp_jax.sweep.spec import Spec, read_spec
-from pregrasp_jax.sweep.trials import make_trial, train_command
+from pregrasp_jax.sweep.trials import make_trial, train_command, trial_config
 from pregrasp_jax.sweep.worker import Worker
 
 LauncherName = Literal["local", "ray", "slurm"]
@@ -85,7 +85,7 @@ def status(folder: Path, /, *, json: Path | None = None) -> None:
     spec, states = opened.spec(), opened.states()
     running = [s.trial.id for s in states if not s.over and opened.is_running(s.trial)]
     words = driver.status(spec, states, running)
-    print(driver.progress_line(spec, states, running=len(running)))
+    print(driver.progress_line(spec, states, running=len(running), slots=len(running)))
     for s in states:
         score = "" if s.score is None else f"{spec.stop.metric} {s.score:.3g}"
         said = f"({s.message})" if s.message and words[s.trial.id] in ("failed", "refused", "paused") else ""
@@ -222,7 +222,7 @@ def _share_trained(spec: Spec, trained: Sequence[checks.Setting]) -> float:
     steps = state.rungs(spec)
     if not steps:
         return 1.0
-    length = checks.trial_config(spec, {**spec.set, **trained[0][0]}).train.env_steps
+    length = trial_config(spec, {**spec.set, **trained[0][0]}).train.env_steps
     ends = [*steps, length]
     parts = [spec.stop.keep**i * (end - start) for i, (start, end) in enumerate(zip([0, *ends], ends, strict=False))]
     return sum(parts) / length

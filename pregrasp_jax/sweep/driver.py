@@ -15,8 +15,9 @@ from pregrasp_jax.sweep.launchers import Launcher
 from pregrasp_jax.sweep.spec import Spec
 from pregrasp_jax.sweep.state import TrialState
 from pregrasp_jax.sweep.study import Study
-from pregrasp_jax.sweep.trials import Trial, final_trials, setting_trials
+from pregrasp_jax.sweep.trials import Trial, final_trials, setting_trials, trial_config
 from pregrasp_jax.sweep.worker import BUSY, UNWRITTEN
+from pregrasp_jax.training.console import format_time
 
 Say = Callable[[str], None]
 
@@ -150,7 +151,7 @@ class Driver:
         now = time.monotonic()
         if ended or now - self._said >= SAY_EVERY:
             self._said = now
-            self.say(progress_line(self.spec, states, running=len(self._submitted)))
+            self.say(progress_line(self.spec, states, running=len(self._submitted), slots=self.launcher.slots))
 
     def _listen(self, number: int, frame: FrameType | None) -> None:
         self._signal = number
@@ -179,15 +180,34 @@ def plan_finals(folder: SweepFolder, spec: Spec, states: Sequence[TrialState]) -
     return bool(new)
 
 
-def progress_line(spec: Spec, states: Sequence[TrialState], *, running: int) -> str:
-    """Return how far a sweep is, in one line."""
+def progress_line(spec: Spec, states: Sequence[TrialState], *, running: int, slots: int) -> str:
+    """Return how far a sweep is, in one line; `slots` trials are done at a time."""
     counts = Counter(status(spec, states).values())
     parts = [f"{counts['done']} of {len(states)} trials done", f"{running} running"]
     parts += [f"{counts[name]} {name}" for name in ("paused", "dropped", "failed", "refused") if counts[name]]
     best = max((s for s in states if s.score is not None), key=lambda s: s.score or 0.0, default=None)
     if best is not None:
         parts.append(f"best {spec.stop.metric} {best.score:.3g} ({best.trial.label}, seed {best.trial.seed})")
+    parts.append(f"left about {format_time(seconds_left(spec, states) / max(1, slots))}")
     return " | ".join(parts)
+
+
+def seconds_left(spec: Spec, states: Sequence[TrialState]) -> float:
+    """Return the time that what is left takes, one trial after the other, by the speed of those that are done.
+
+    Nothing is known of settings that halving will give up, nor of those that are not planned yet.
+    """
+    done = [s for s in states if s.outcome == state.DONE]
+    gone = state.dropped(spec, states)
+    left = 0.0
+    for s in states:
+        if s.over or s.trial.id in gone or s.trial.policy is not None:
+            continue
+        alike = [d.seconds for d in done if d.trial.policy is None]
+        whole = state.mean(alike) if alike else checks.seconds_of(spec, s.trial.settings)
+        length = trial_config(spec, s.trial.settings).train.env_steps
+        left += whole * (1 - min(1.0, s.env_steps / length) if length else 1.0)
+    return left
 
 
 def status(spec: Spec, states: Sequence[TrialState], running: Sequence[str] = ()) -> dict[str, str]:
