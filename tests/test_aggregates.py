@@ -41,14 +41,14 @@ def test_strata_have_equal_weight_whatever_their_size():
 def test_one_seed_is_a_bootstrap_over_scenes():
     sample = np.arange(200) < 150
     low, high = aggregates.interval(outcomes([sample]))
-    expected = stats.bootstrap((sample.astype(float),), np.mean, n_resamples=4000, method="percentile", rng=0)
+    expected = stats.bootstrap((sample.astype(float),), np.mean, n_resamples=2000, method="percentile", rng=0)
     assert (low, high) == pytest.approx(tuple(expected.confidence_interval), abs=0.01)
 
 
 @pytest.mark.parametrize(("seeds", "least"), [(3, 0.86), (6, 0.9)])
 def test_the_interval_holds_the_truth_nearly_as_often_as_it_says(seeds, least):
     """Seeds that differ by six points: an interval of the pooled episodes holds it far less often."""
-    generator, inside, pooled_inside, times = np.random.default_rng(1), 0, 0, 120
+    generator, inside, pooled_inside, times = np.random.default_rng(1), 0, 0, 80
     for _ in range(times):
         sample = draw(generator, seeds=seeds, scenes=150, rate=0.7, between=0.06)
         low, high = aggregates.interval(outcomes(sample))
@@ -75,7 +75,7 @@ def test_pairing_by_scene_narrows_the_interval_of_a_difference():
 
 
 def test_no_difference_is_called_one_about_as_often_as_it_should_be():
-    generator, times = np.random.default_rng(3), 150
+    generator, times = np.random.default_rng(3), 80
     called = 0
     for _ in range(times):
         a, b = (draw(generator, seeds=4, scenes=100, rate=0.7, between=0.05) for _ in range(2))

@@ -1,5 +1,6 @@
 """Every table and figure of the paper is a sweep that this version knows, or says in one line what it lacks."""
 
+import dataclasses
 import html
 import json
 import re
@@ -124,6 +125,11 @@ def test_the_same_command_goes_on_and_another_budget_is_refused(reproduced):
     again = _open(folder.path, spec)
     assert Driver(again, spec, Here(again, spec), say=lambda line: None).run() == 0
     assert sum(event["event"] == "started" for event in folder.events()) == 8
+    more = dataclasses.replace(spec, tests={**spec.tests, "mine": {"episodes": 30}})
+    again = _open(folder.path, more)
+    assert Driver(again, again.spec(), Here(again, again.spec()), say=lambda line: None).run() == 0
+    assert all((folder.run(known.trial) / "evaluations" / "mine.json").exists() for known in folder.states())
+    assert all(len((folder.run(k.trial) / "sessions").read_text().splitlines()) == 1 for k in folder.states())
     other = with_stub(experiments.make_spec(experiments.read_experiment("table2")), **{"train.env_steps": 400})
     with pytest.raises(ValueError, match=r"began with another set .*; allowed is the same, or another --dir"):
         _open(folder.path, other)

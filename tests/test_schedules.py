@@ -1,16 +1,20 @@
 """Schedules are fractions of the run unless numbers were given, and their length is settled once."""
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import optax
 import pytest
-from fake_training import make_config, make_trainer, rows, run, stop_after, timeless
+from fake_training import make_config, rows, run, stop_after, timeless
 
+from pregrasp_jax import io
 from pregrasp_jax.config import PRESETS, Config, from_dict, to_dict
-from pregrasp_jax.training import schedules
-from pregrasp_jax.training.run_folder import RunFolder
+from pregrasp_jax.training import learn, schedules
 
 
 def changed(config: Config, **stages: dict[str, Any]) -> Config:
@@ -98,22 +102,6 @@ def test_a_run_ends_after_its_env_steps_and_its_schedules_with_it(tmp_path):
 
 def test_a_length_of_minutes_is_settled_once_and_survives_a_stop_and_other_minutes(tmp_path, monkeypatch):
     """Sixty steps of which the clock says that they are as many as fit into the minutes, then a slower machine."""
-    monkeypatch.setattr(schedules, "measured_length", lambda *args, **options: 60)
-    config = scheduled(minutes=500.0)
-    whole = run(tmp_path / "whole", changed(config, train={"env_steps": 0}), stop=stop_after(20))
-    assert whole.recorder.counters.length == 60
-
-    path: Path = tmp_path / "pieces"
-    first = run(path, config, stop=stop_after(14))
-    assert first.recorder.counters.length == 60
-    monkeypatch.setattr(schedules, "measured_length", lambda *args, **options: 7_000)
-    longer = changed(config, train={"minutes": 900.0})
-    second = run(path, longer, resume=True, stop=stop_after(6))
-    assert second.recorder.counters.length == 60
-    assert timeless(path) == timeless(tmp_path / "whole")
-
-
-def test_until_the_speed_is_known_nothing_moves(tmp_path, monkeypatch):
     calls = []
 
     def measure(config: Config, *, env_steps: int, seconds: float, steps_per_second: float) -> int:
@@ -121,22 +109,42 @@ def test_until_the_speed_is_known_nothing_moves(tmp_path, monkeypatch):
         return 60
 
     monkeypatch.setattr(schedules, "measured_length", measure)
-    run(tmp_path / "run", scheduled(minutes=500.0), stop=stop_after(20))
+    config = scheduled(minutes=500.0)
+    whole = run(tmp_path / "whole", config, stop=stop_after(20))
     settled = 6 + schedules.MEASURED_STEPS * 3
-    assert calls == [(settled, True)]
-    epsilon = {row["env_steps"]: row["train/epsilon"] for row in rows(tmp_path / "run")}
-    assert epsilon[settled - 6] == 1.0 and epsilon[settled + 6] == pytest.approx(0.1)
+    assert calls == [(settled, True)] and whole.recorder.counters.length == 60
+    epsilon = {row["env_steps"]: row["train/epsilon"] for row in rows(tmp_path / "whole")}
+    assert epsilon[settled - 6] == 1.0 and epsilon[settled + 6] == pytest.approx(0.1), "until then nothing moves"
+
+    path: Path = tmp_path / "pieces"
+    assert run(path, config, stop=stop_after(14)).recorder.counters.length == 60
+    monkeypatch.setattr(schedules, "measured_length", lambda *args, **options: 7_000)
+    longer = changed(config, train={"minutes": 900.0})
+    assert run(path, longer, resume=True, stop=stop_after(6)).recorder.counters.length == 60
+    assert timeless(path) == timeless(tmp_path / "whole")
 
 
 def test_a_run_of_the_first_release_goes_on(tmp_path):
     """Its configuration has numbers and neither fractions nor env_steps; its checkpoint knows no length."""
-    old = to_dict(make_config(episodes=24))
+    old = to_dict(make_config(episodes=8))
     del old["train"]["env_steps"], old["replay"]["importance_fraction"]
     del old["learner"]["learning_rate_fraction"], old["exploration"]["epsilon_fraction"]
     old["learner"]["learning_rate_steps"] = 30
     config = from_dict(old).validate()
     run(tmp_path / "old", config, stop=stop_after(4))
-    with RunFolder.open(tmp_path / "old", config) as folder:
-        trainer = make_trainer(tmp_path / "old", config, folder=folder)
-        trainer.recorder.counters = dataclasses.replace(trainer.recorder.counters, length=None)
-        assert trainer.pace.epsilon_decay == 64 and trainer.pace.learning_rate_steps == 30
+    for file in (tmp_path / "old" / "checkpoints").glob("*/manifest.json"):
+        manifest = json.loads(file.read_text())
+        del manifest["checksum"], manifest["extra"]["length"]
+        io.write_json(file, {"checksum": io.content_hash(manifest), **manifest})
+    trainer = run(tmp_path / "old", config, resume=True)
+    assert trainer.pace.epsilon_decay == 64 and trainer.pace.learning_rate_steps == 30
+    assert trainer.recorder.counters.length == 32 and rows(tmp_path / "old")[-1]["episodes"] >= 8
+
+
+def test_the_optimizer_has_the_state_that_it_had_in_the_first_release():
+    steady = PRESETS["ci"].learner
+    for steps, then in ((0, optax.adam(1e-4)), (30, optax.adam(optax.linear_schedule(1e-4, 1e-5, 30)))):
+        config = dataclasses.replace(steady, learning_rate_steps=steps)
+        now = learn.make_optimizer(config, 30)
+        params = {"w": jnp.zeros(3)}
+        assert jax.tree.structure(now.init(params)) == jax.tree.structure(then.init(params))

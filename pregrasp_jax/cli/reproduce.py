@@ -91,6 +91,7 @@ def _open(path: Path, spec: Spec) -> SweepFolder:
                 "another --dir"
             )
     folder.ask_to_stop(False)
+    folder.edit(tests=spec.tests, resources=spec.resources)
     return folder
 
 

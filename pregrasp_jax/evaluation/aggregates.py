@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-DRAWS = 4000
+DRAWS = 2000
 """Of the bootstrap: the ends of a 95 % interval then repeat within about a tenth of its width."""
 
 _ENDS = (2.5, 97.5)

@@ -13,7 +13,7 @@ from pregrasp_jax.sweep import checks, state
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.launchers import Launcher
 from pregrasp_jax.sweep.spec import Spec
-from pregrasp_jax.sweep.state import TrialState
+from pregrasp_jax.sweep.state import Job, TrialState
 from pregrasp_jax.sweep.study import Study
 from pregrasp_jax.sweep.trials import Trial, final_trials, setting_trials, trial_config
 from pregrasp_jax.sweep.worker import BUSY, UNWRITTEN
@@ -71,7 +71,7 @@ class Driver:
             states = self._collect()
             if self._signal or self.folder.stopping:
                 return self._stop()
-            jobs = [job for job in state.next_jobs(self.spec, states) if job.trial.id not in self._submitted]
+            jobs = [job for job in self._jobs(states) if job.trial.id not in self._submitted]
             others = {job.trial.id for job in jobs if self.folder.is_running(job.trial)}
             ready = [job for job in jobs if job.trial.id not in others]
             room = self._room(len(others), states)
@@ -87,6 +87,13 @@ class Driver:
                 self._tell(states, ended=True)
                 return 1 if any(s.failed for s in states) else 0
             time.sleep(POLL)
+
+    def _jobs(self, states: Sequence[TrialState]) -> list[Job]:
+        """Return what can be done now; at the end, tests that finished trials lack."""
+        done = (s.trial for s in states if s.outcome == state.DONE)
+        return state.next_jobs(self.spec, states) or [
+            Job(trial, None) for trial in done if self.folder.lacks_tests(self.spec, trial)
+        ]
 
     def _collect(self) -> list[TrialState]:
         """Take note of the workers that have ended, and return the states."""

@@ -7,6 +7,7 @@ Several processes add to trials.jsonl, perhaps on several hosts. Who works on a 
 training that it started: a lock is free when both have ended, however that happened.
 """
 
+import dataclasses
 import fcntl
 import json
 import os
@@ -20,7 +21,7 @@ from typing import Any, TextIO
 from pregrasp_jax import io, yaml_file
 from pregrasp_jax.sweep.spec import Spec, read_spec, spec_from, to_plain
 from pregrasp_jax.sweep.state import Record, TrialState, read_states
-from pregrasp_jax.sweep.trials import Trial
+from pregrasp_jax.sweep.trials import Trial, evaluation_file, evaluations_of
 
 SPEC, TRIALS, STOP = "spec.yaml", "trials.jsonl", "stop"
 
@@ -83,6 +84,10 @@ class SweepFolder:
                 )
         return spec
 
+    def edit(self, **parts: Any) -> None:
+        """Change parts of the spec, of those that may change."""
+        io.write_bytes(self.path / SPEC, yaml_file.dump(to_plain(dataclasses.replace(self.spec(), **parts))))
+
     @property
     def cwd(self) -> Path:
         """Where the sweep was started, to which relative paths refer."""
@@ -96,6 +101,10 @@ class SweepFolder:
     def log(self, trial: Trial) -> Path:
         """Return the file of what a trial has said."""
         return self.path / "logs" / f"{trial.id}.log"
+
+    def lacks_tests(self, spec: Spec, trial: Trial) -> bool:
+        """Return whether a trial that is done has tests to go through: of a spec that was edited since."""
+        return any(not evaluation_file(self.run(trial), name).exists() for name in evaluations_of(spec, trial))
 
     def append(self, event: Mapping[str, Any]) -> None:
         """Add an event, whole or not at all; a last line that a crash has cut is removed first.

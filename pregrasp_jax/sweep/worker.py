@@ -76,13 +76,16 @@ class Worker:
         try:
             with self.folder.hold(self.trial, patience=PATIENCE) as self._lock_fd:
                 now = next(s for s in self.folder.states() if s.trial.id == self.trial.id)
-                if now.settled(self.rung) or self.folder.stopping:
-                    return 0 if now.settled(self.rung) else _EXIT_CODES[state.STOPPED]
-                return self._session()
+                trained = now.outcome == state.DONE
+                if now.settled(self.rung) and not (trained and self.folder.lacks_tests(self.spec, self.trial)):
+                    return 0
+                if self.folder.stopping:
+                    return _EXIT_CODES[state.STOPPED]
+                return self._session(trained)
         except BlockingIOError:
             return BUSY
 
-    def _session(self) -> int:
+    def _session(self, trained: bool) -> int:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._ask_to_stop)
         if self._cores and hasattr(os, "sched_setaffinity"):
@@ -90,7 +93,7 @@ class Worker:
         start = time.monotonic()
         if not self._record({"event": "started", "id": self.trial.id, "rung": self.rung}):
             return UNWRITTEN
-        ending = self._work()
+        ending = self._work(trained)
         event = {"event": "ended", "id": self.trial.id, "rung": self.rung, "outcome": ending.outcome}
         event |= {"exit_code": ending.code, "message": ending.message, "seconds": round(time.monotonic() - start, 1)}
         rows, metric = read_metrics(self.run_dir), self.spec.stop.metric
@@ -99,8 +102,8 @@ class Worker:
         written = self._record(event | measured(rows, metric, None) | known)
         return _EXIT_CODES[ending.outcome] if written else UNWRITTEN
 
-    def _work(self) -> _Ending:
-        if self.trial.policy is None:
+    def _work(self, trained: bool) -> _Ending:
+        if self.trial.policy is None and not trained:
             ending = self._train()
             if ending.outcome != state.DONE:
                 return ending
