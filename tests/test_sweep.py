@@ -281,6 +281,9 @@ def test_refused_is_not_tried_again_and_crashed_is_and_the_sweep_goes_on(tmp_pat
     }  # fmt: skip
     assert found[0.05].message == "error: task.r_in = 0.05 is not liked here"
     assert found[0.06].message == "Segmentation fault" and "1 failed | 1 refused" in said[-1]
+    folder.append({"event": "retry", "id": found[0.05].trial.id})
+    again = Here(folder, spec)
+    assert drive(folder, spec, again) == 1 and [job.trial for job in again.order] == [found[0.05].trial]
 
 
 def test_tpe_asks_for_what_looks_good_and_forgets_nothing_when_it_goes_on(tmp_path):

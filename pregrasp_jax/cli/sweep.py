@@ -58,18 +58,23 @@ def start(
     return drive(SweepFolder.create(dir, read), read, launcher=launcher, parallel=parallel)
 
 
-def resume(folder: Path, /, *, launcher: LauncherName = "local", parallel: int | None = None) -> int:
-    """Go on with a sweep where it stopped, whatever stopped it; trials that failed three times are left alone.
+def resume(
+    folder: Path, /, *, launcher: LauncherName = "local", parallel: int | None = None, retry: bool = False
+) -> int:
+    """Go on with a sweep where it stopped, whatever stopped it.
 
     Args:
         folder: of the sweep.
         launcher: as in `start`; it may be another one.
         parallel: as in `start`.
+        retry: whether trials that were refused, or failed three times, are tried again.
     """
     opened = SweepFolder.open(folder)
     spec = opened.spec()
     checks.check(spec)
     opened.ask_to_stop(False)
+    for failed in [s for s in opened.states() if retry and s.failed]:
+        opened.append({"event": "retry", "id": failed.trial.id})
     return drive(opened, spec, launcher=launcher, parallel=parallel)
 
 

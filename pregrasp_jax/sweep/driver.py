@@ -162,6 +162,7 @@ class Driver:
 
     def _listen(self, number: int, frame: FrameType | None) -> None:
         self._signal = number
+        signal.signal(number, signal.SIG_DFL)  # a second one ends the driver at once; the workers stop by themselves
 
 
 def plan(folder: SweepFolder, spec: Spec) -> None:

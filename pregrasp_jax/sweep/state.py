@@ -76,6 +76,8 @@ def read_states(events: Sequence[Record]) -> list[TrialState]:
             states.setdefault(trial.id, TrialState(trial))
         elif event["event"] == "started":
             states[event["id"]].begun = True
+        elif event["event"] == "retry":
+            states[event["id"]].outcome, states[event["id"]].failures = "", 0
         elif event["event"] == "ended":
             _end(states[event["id"]], event)
     return sorted(states.values(), key=lambda state: state.trial.number)
