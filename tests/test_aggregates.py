@@ -59,6 +59,17 @@ def test_the_interval_holds_the_truth_nearly_as_often_as_it_says(seeds, least):
     assert inside / times >= least > pooled_inside / times
 
 
+def test_nothing_but_successes_or_failures_is_not_certainty():
+    all_good, all_bad = outcomes(np.ones((2, 20))), outcomes(np.zeros((2, 20)))
+    expected = stats.binomtest(40, 40).proportion_ci(method="wilson")
+    assert aggregates.interval(all_good) == pytest.approx((expected.low, 1.0), abs=1e-6)
+    same = aggregates.compare_settings(all_good, all_good)
+    assert same.interval[0] < -0.05 and same.interval[1] > 0.05 and same.p_value == 1
+    assert aggregates.compare_settings(all_good, all_bad).p_value < 0.01
+    low, high = aggregates.measured_interval([0.0], 2)
+    assert low == 0 and high == pytest.approx(stats.binomtest(0, 2).proportion_ci(method="wilson").high, abs=1e-6)
+
+
 def test_pairing_by_scene_narrows_the_interval_of_a_difference():
     generator = np.random.default_rng(2)
     hard = generator.random(200) < 0.4

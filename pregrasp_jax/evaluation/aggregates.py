@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from pregrasp_jax.evaluation.statistics import wilson_interval
+
 DRAWS = 2000
 """Of the bootstrap: the ends of a 95 % interval then repeat within about a tenth of its width."""
 
@@ -102,10 +104,13 @@ def by_scene(document: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def interval(outcomes: Outcomes, *, seed: int = 0) -> tuple[float, float]:
-    """Return the 95 % interval of a success rate over seeds and scenes; of one seed over scenes alone."""
+    """Return the 95 % interval of a success rate over seeds and scenes; of one seed over scenes alone.
+
+    It is never narrower than Wilson's of all episodes: a bootstrap of nothing but successes has no width.
+    """
     generator = np.random.default_rng(seed)
     draws = _draw_rates(outcomes, _draw_scenes(outcomes.strata, generator), generator)
-    return _percentiles(np.clip(draws, 0.0, 1.0))
+    return _at_least_wilson(_percentiles(np.clip(draws, 0.0, 1.0)), outcomes.rate, outcomes.successes.size)
 
 
 def compare_settings(a: Outcomes, b: Outcomes, *, seed: int = 0) -> Difference:
@@ -125,7 +130,7 @@ def compare_settings(a: Outcomes, b: Outcomes, *, seed: int = 0) -> Difference:
     tail = min((draws <= 0).mean(), (draws >= 0).mean())
     return Difference(
         difference=a.rate - b.rate,
-        interval=_percentiles(draws),
+        interval=_percentiles(draws) if np.ptp(draws) else _unpaired(a, b),
         p_value=float(min(1.0, max(2 * tail, 1 / DRAWS))),
         improvement=probability_of_improvement(a.rates, b.rates),
     )
@@ -188,7 +193,8 @@ def measured_interval(rates: Sequence[float], scenes: int, *, seed: int = 0) -> 
     by_scenes = generator.binomial(scenes, values.mean(), DRAWS) / scenes - values.mean()
     by_seeds = _seed_part(values[None], generator)[0] if len(values) > 1 else np.zeros(DRAWS)
     spread = max((by_scenes, by_seeds), key=np.std)
-    return _percentiles(np.clip(values.mean() + spread, 0.0, 1.0))
+    bootstrap = _percentiles(np.clip(values.mean() + spread, 0.0, 1.0))
+    return _at_least_wilson(bootstrap, float(values.mean()), scenes * len(values))
 
 
 def _draw_scenes(strata: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -223,6 +229,20 @@ def _seed_part(by_seed: np.ndarray, generator: np.random.Generator) -> np.ndarra
     else:
         drawn, center = np.take_along_axis(by_seed, picked, axis=1).mean(axis=1), by_seed.mean(axis=1)
     return (drawn - center) * np.sqrt(num_seeds / (num_seeds - 1))
+
+
+def _at_least_wilson(bootstrap: tuple[float, float], rate: float, episodes: int) -> tuple[float, float]:
+    low, high = wilson_interval(round(rate * episodes), episodes)
+    return min(low, bootstrap[0]), max(high, bootstrap[1])
+
+
+def _unpaired(a: Outcomes, b: Outcomes) -> tuple[float, float]:
+    """Return the interval of a difference from both intervals alone. Source: Newcombe (1998), his method 10 unpaired."""
+    (low_a, high_a), (low_b, high_b) = interval(a), interval(b)
+    difference = a.rate - b.rate
+    below = np.hypot(a.rate - low_a, high_b - b.rate)
+    above = np.hypot(high_a - a.rate, b.rate - low_b)
+    return float(difference - below), float(difference + above)
 
 
 def _percentiles(draws: np.ndarray) -> tuple[float, float]:
