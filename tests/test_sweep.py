@@ -25,7 +25,8 @@ from pregrasp_jax.sweep.launchers import Launcher, LocalLauncher, Slot
 from pregrasp_jax.sweep.page import write_page
 from pregrasp_jax.sweep.spec import Spec, spec_from
 from pregrasp_jax.sweep.state import Job, TrialState
-from pregrasp_jax.sweep.table import format_table, make_table
+from pregrasp_jax.sweep.table import make_table
+from pregrasp_jax.sweep.table_files import format_table
 from pregrasp_jax.sweep.worker import BUSY, UNWRITTEN, Worker, environment, measured
 
 STUB = Path(__file__).parent / "stub_trainer.py"

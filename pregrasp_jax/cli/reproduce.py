@@ -7,8 +7,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from pregrasp_jax.cli.sweep import LauncherName, describe, drive
+from pregrasp_jax.cli.sweep import LauncherName, drive
 from pregrasp_jax.sweep import checks, experiments
+from pregrasp_jax.sweep.estimate import describe
 from pregrasp_jax.sweep.experiments import Experiment
 from pregrasp_jax.sweep.folder import CHANGEABLE, SPEC, SweepFolder
 from pregrasp_jax.sweep.spec import Spec, to_plain

@@ -1,6 +1,5 @@
 """`pregrasp-jax sweep`: start, follow, stop and go on with many trainings; docs/sweeps.md explains them."""
 
-import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -9,12 +8,13 @@ from typing import Literal
 
 from pregrasp_jax import io
 from pregrasp_jax.cli.command_line import deferred
-from pregrasp_jax.sweep import checks, driver, state, table
+from pregrasp_jax.sweep import checks, driver, table
 from pregrasp_jax.sweep.driver import Driver
+from pregrasp_jax.sweep.estimate import describe, memory_of
 from pregrasp_jax.sweep.folder import SweepFolder
-from pregrasp_jax.sweep.launchers import Launcher, LocalLauncher, share_out
+from pregrasp_jax.sweep.launchers import Launcher, LocalLauncher
 from pregrasp_jax.sweep.spec import Spec, read_spec
-from pregrasp_jax.sweep.trials import make_trial, train_command, trial_config
+from pregrasp_jax.sweep.table_files import format_table, to_dict, write_table
 from pregrasp_jax.sweep.worker import Worker
 
 LauncherName = Literal["local", "ray", "slurm"]
@@ -111,10 +111,10 @@ def show_table(folder: Path, /, *, json: Path | None = None, reference: str | No
     _refuse_json(json)
     opened = SweepFolder.open(folder)
     made = table.make_table(opened, opened.spec(), reference=reference)
-    print(table.format_table(made))
-    table.write_table(opened, made)
+    print(format_table(made))
+    write_table(opened, made)
     if json:
-        io.write_json(json, table.to_dict(made))
+        io.write_json(json, to_dict(made))
 
 
 def stop(folder: Path, /) -> None:
@@ -184,53 +184,12 @@ def drive(folder: SweepFolder, spec: Spec, *, launcher: LauncherName, parallel: 
         return 0
     code = Driver(folder, spec, _launcher(folder, spec, launcher, parallel), say=_say).run()
     made = table.make_table(folder, spec)
-    table.write_table(folder, made)
-    print(table.format_table(made), flush=True)
+    write_table(folder, made)
+    print(format_table(made), flush=True)
     if code in (0, 1):
         # In a process of its own: a page takes JAX, which this one does without.
         subprocess.run([sys.executable, "-m", "pregrasp_jax", "sweep", "report", str(folder.path)], check=False)
     return code
-
-
-def describe(spec: Spec, *, launcher: LauncherName = "local", parallel: int | None = None) -> list[str]:
-    """Return what a sweep will do, and refuse what does not fit here.
-
-    Raises:
-        ValueError: this machine or this launcher cannot run it.
-    """
-    settings, memory = checks.num_settings(spec), checks.memory_of(spec)
-    checked = checks.settings_to_check(spec)
-    trained = [setting for setting in checked if setting[1].get("policy") is None]
-    share = len(trained) / max(1, len(checked))
-    trials = round(settings * share) * len(spec.seeds) + round(settings * (1 - share))
-    finals = spec.final.top * len(spec.final.seeds)
-    one = max((checks.seconds_of(spec, {**spec.set, **varied}) for varied, _ in trained), default=0.0)
-    # Of halving, every rung is reached by fewer; what is left goes to the end.
-    whole = trials * one * _share_trained(spec, trained) + finals * one
-    slots = parallel or 1
-    if launcher == "local":
-        slots = len(share_out(spec, parallel=parallel, memory=memory))
-    lines = [
-        f"{settings} settings, {trials} trials{f', then {finals} with fresh seeds' if finals else ''}; each takes "
-        f"{spec.resources.cores} core{'s' if spec.resources.cores > 1 else ''}, {memory / 1e9:.1f} GB"
-        f"{f', {spec.resources.gpu:g} GPU' if spec.resources.gpu else ''}; {slots} at a time",
-        f"about {whole / slots / 3600:.1f} hours, at the speed of two cores of docs/presets.md",
-    ]
-    for varied, about in trained[:1]:
-        command = train_command(spec, make_trial(spec, varied, spec.seeds[0], number=0, **about), Path("RUN"))
-        lines.append(f"the first: {shlex.join(command)}")
-    return lines
-
-
-def _share_trained(spec: Spec, trained: Sequence[checks.Setting]) -> float:
-    """Return how much of all trainings is done, at most 1, if halving gives some up."""
-    steps = state.rungs(spec)
-    if not steps:
-        return 1.0
-    length = trial_config(spec, {**spec.set, **trained[0][0]}).train.env_steps
-    ends = [*steps, length]
-    parts = [spec.stop.keep**i * (end - start) for i, (start, end) in enumerate(zip([0, *ends], ends, strict=False))]
-    return sum(parts) / length
 
 
 def _launcher(folder: SweepFolder, spec: Spec, name: LauncherName, parallel: int | None) -> Launcher:
@@ -238,7 +197,7 @@ def _launcher(folder: SweepFolder, spec: Spec, name: LauncherName, parallel: int
         from pregrasp_jax.sweep.ray_launcher import RayLauncher
 
         return RayLauncher(folder, spec, parallel=parallel)
-    return LocalLauncher(folder, spec, parallel=parallel, memory=checks.memory_of(spec))
+    return LocalLauncher(folder, spec, parallel=parallel, memory=memory_of(spec))
 
 
 def _say(line: str) -> None:

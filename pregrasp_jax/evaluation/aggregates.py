@@ -237,7 +237,7 @@ def _at_least_wilson(bootstrap: tuple[float, float], rate: float, episodes: int)
 
 
 def _unpaired(a: Outcomes, b: Outcomes) -> tuple[float, float]:
-    """Return the interval of a difference from both intervals alone. Source: Newcombe (1998), his method 10 unpaired."""
+    """Return the interval of a difference from both intervals alone. Source: Newcombe (1998), method 10."""
     (low_a, high_a), (low_b, high_b) = interval(a), interval(b)
     difference = a.rate - b.rate
     below = np.hypot(a.rate - low_a, high_b - b.rate)

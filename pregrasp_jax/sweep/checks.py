@@ -1,12 +1,11 @@
-"""Everything that can be known to be wrong before the first trial starts, one line each; and what a sweep will take."""
+"""Everything that can be known to be wrong before the first trial starts, one line each."""
 
 import itertools
-import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pregrasp_jax.config import Config, EvaluationConfig, from_dict, to_dict
+from pregrasp_jax.config import EvaluationConfig, from_dict, to_dict
 from pregrasp_jax.spaces.workspace import WORKSPACES, get_workspace
 from pregrasp_jax.sweep import parameters
 from pregrasp_jax.sweep.spec import PROGRAM, Spec
@@ -16,15 +15,6 @@ GIVEN = {"seed": "seeds", "physics.threads": "resources.cores"}
 """Settings that other keys of a sweep decide."""
 
 LIMITS = ("train.env_steps", "train.episodes", "train.minutes")
-
-_PROGRAM_MEMORY, _WIDE_MEMORY, _OBSERVATION_MEMORY = 1.2e9, 1.2e9, 20.2e3
-"""Bytes of a training: all but its replay, what the paper's network takes beside that, an observation."""
-
-_STEPS_PER_SECOND = {"ci": 49.0, "demo": 6.0, "cpu": 7.1, "paper": 1.8}
-"""Env steps per second on two cores (docs/presets.md), for an estimate of hours."""
-
-_START = 100.0
-"""s until a training of a sweep makes its first push, compilation included."""
 
 Setting = tuple[Mapping[str, Any], Mapping[str, Any]]
 """What varies, and what else `trials.make_trial` must know."""
@@ -67,22 +57,6 @@ def settings_to_check(spec: Spec) -> list[Setting]:
     middle = {name: parameter.given[0] for name, parameter in spec.parameters.items()}
     corners = ((name, value) for name, parameter in spec.parameters.items() for value in parameter.corners())
     return [(middle | {name: value}, {}) for name, value in corners]
-
-
-def memory_of(spec: Spec) -> float:
-    """Return the bytes that the largest trial takes, or is given."""
-    if spec.resources.memory_gb is not None:
-        return 1e9 * spec.resources.memory_gb
-    trained = [trial_config(spec, {**spec.set, **varied}) for varied, about in _trained(spec)]
-    return max((_memory(config) for config in trained), default=_PROGRAM_MEMORY)
-
-
-def seconds_of(spec: Spec, settings: Mapping[str, Any]) -> float:
-    """Return about how long a trial takes on the two cores of docs/presets.md."""
-    config = trial_config(spec, settings)
-    train = config.train
-    steps = min(train.env_steps or math.inf, 4 * train.episodes) / _STEPS_PER_SECOND.get(spec.preset, 5.0)
-    return _START + min(60 * train.minutes or math.inf, steps)
 
 
 def num_settings(spec: Spec) -> int:
@@ -201,15 +175,6 @@ def _check_test(spec: Spec, name: str, options: Mapping[str, Any]) -> None:
     checked = from_dict(values, EvaluationConfig, f"tests.{name}.")
     if spec.program == PROGRAM and checked.task.workspace not in (None, *WORKSPACES):
         get_workspace(checked.task.workspace)
-
-
-def _trained(spec: Spec) -> list[Setting]:
-    return [(varied, about) for varied, about in settings_to_check(spec) if about.get("policy") is None]
-
-
-def _memory(config: Config) -> float:
-    wide = config.network.architecture == "paper" and config.network.width >= 1
-    return _PROGRAM_MEMORY + (_WIDE_MEMORY if wide else 0) + _OBSERVATION_MEMORY * config.replay.capacity
 
 
 def _different(spec: Spec) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from types import FrameType
 
-from pregrasp_jax.sweep import checks, state
+from pregrasp_jax.sweep import checks, estimate, state
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.launchers import Launcher
 from pregrasp_jax.sweep.spec import Spec
@@ -45,10 +45,10 @@ class Driver:
         """
         self.folder, self.spec, self.launcher, self.say = folder, spec, launcher, say
         self._study = Study(folder.path, spec) if spec.search.method == "tpe" else None
-        self._submitted: dict[str, float] = {}
+        self._submitted: set[str] = set()
         self._lost: Counter[str] = Counter()
         self._signal = 0
-        self._start, self._said = time.monotonic(), 0.0
+        self._said = 0.0
 
     def run(self) -> int:
         """Return 0 when all is done, 1 if trials have failed, 128 + signal (143 for `sweep stop`) if asked to stop.
@@ -76,13 +76,13 @@ class Driver:
             ready = [job for job in jobs if job.trial.id not in others]
             room = self._room(len(others), states)
             for job in ready[:room]:
-                self._submitted[job.trial.id] = time.monotonic()
+                self._submitted.add(job.trial.id)
                 self.launcher.submit(job)
             idle = room - len(ready)
             if idle > 0 and self._propose(states):
                 continue
             if not (jobs or self._submitted):
-                if self._plan_finals(states):
+                if plan_finals(self.folder, self.spec, states):
                     continue
                 self._tell(states, ended=True)
                 return 1 if any(s.failed for s in states) else 0
@@ -100,7 +100,7 @@ class Driver:
         ended = self.launcher.ended()
         states = self.folder.states()
         for trial_id, code in ended:
-            del self._submitted[trial_id]
+            self._submitted.discard(trial_id)
             self._note_lost(trial_id, code, states)
         self._tell(states, ended=bool(ended))
         return states
@@ -140,16 +140,13 @@ class Driver:
             self.folder.append({"event": "planned", "trial": trial.to_dict()})
         return True
 
-    def _plan_finals(self, states: Sequence[TrialState]) -> bool:
-        return plan_finals(self.folder, self.spec, states)
-
     def _stop(self) -> int:
         """Ask the workers to stop, wait for them, and return the exit code."""
         self.say("stopping: trainings finish their step and write a checkpoint")
         self.launcher.stop()
         while self._submitted:
             for trial_id, _ in self.launcher.ended():
-                self._submitted.pop(trial_id, None)
+                self._submitted.discard(trial_id)
             time.sleep(POLL)
         self.say(f"stopped; `pregrasp-jax sweep resume {self.folder.path}` goes on")
         return 128 + (self._signal or signal.SIGTERM)
@@ -212,7 +209,7 @@ def seconds_left(spec: Spec, states: Sequence[TrialState]) -> float:
         if s.over or s.trial.id in gone or s.trial.policy is not None:
             continue
         alike = [d.seconds for d in done if d.trial.policy is None]
-        whole = state.mean(alike) if alike else checks.seconds_of(spec, s.trial.settings)
+        whole = state.mean(alike) if alike else estimate.seconds_of(spec, s.trial.settings)
         length = trial_config(spec, s.trial.settings).train.env_steps
         left += whole * (1 - min(1.0, s.env_steps / length) if length else 1.0)
     return left

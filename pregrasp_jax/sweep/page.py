@@ -14,7 +14,8 @@ from pregrasp_jax.report.svg import interval_mark
 from pregrasp_jax.sweep import charts, driver
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.spec import Spec, to_plain
-from pregrasp_jax.sweep.table import Row, Table, Tested, make_table, notes, tested_text
+from pregrasp_jax.sweep.table import Row, Table, Tested, make_table
+from pregrasp_jax.sweep.table_files import notes, tested_text
 from pregrasp_jax.sweep.trials import flags
 from pregrasp_jax.sweep.worker import read_metrics
 

@@ -5,7 +5,7 @@ import os
 import subprocess
 from typing import Any
 
-from pregrasp_jax.sweep.checks import memory_of
+from pregrasp_jax.sweep.estimate import memory_of
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.launchers import worker_command
 from pregrasp_jax.sweep.spec import Spec

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pregrasp_jax import io
 from pregrasp_jax.sweep import driver, state
-from pregrasp_jax.sweep.checks import memory_of
+from pregrasp_jax.sweep.estimate import memory_of
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.spec import Spec
 from pregrasp_jax.sweep.trials import Trial
