@@ -30,10 +30,9 @@ def describe(spec: Spec, *, launcher: str = "local", parallel: int | None = None
         ValueError: this machine or this launcher cannot run it.
     """
     settings, memory = num_settings(spec), memory_of(spec)
-    checked = settings_to_check(spec)
-    trained = [setting for setting in checked if setting[1].get("policy") is None]
-    share = len(trained) / max(1, len(checked))
-    trials = round(settings * share) * len(spec.seeds) + round(settings * (1 - share))
+    trained = _trained(spec)
+    scripts = len([variant for variant in spec.variants.values() if variant.policy is not None])
+    trials = (settings - scripts) * len(spec.seeds) + scripts
     finals = spec.final.top * len(spec.final.seeds)
     one = max((seconds_of(spec, {**spec.set, **varied}) for varied, _ in trained), default=0.0)
     # Of halving, every rung is reached by fewer; what is left goes to the end.
