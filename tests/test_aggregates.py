@@ -46,9 +46,10 @@ def test_one_seed_is_a_bootstrap_over_scenes():
 
 
 @pytest.mark.parametrize(("seeds", "least"), [(3, 0.86), (6, 0.9)])
-def test_the_interval_holds_the_truth_nearly_as_often_as_it_says(seeds, least):
+def test_the_interval_holds_the_truth_nearly_as_often_as_it_says(seeds, least, monkeypatch):
     """Seeds that differ by six points: an interval of the pooled episodes holds it far less often."""
-    generator, inside, pooled_inside, times = np.random.default_rng(1), 0, 0, 80
+    monkeypatch.setattr(aggregates, "DRAWS", 300)
+    generator, inside, pooled_inside, times = np.random.default_rng(1), 0, 0, 150
     for _ in range(times):
         sample = draw(generator, seeds=seeds, scenes=150, rate=0.7, between=0.06)
         low, high = aggregates.interval(outcomes(sample))
@@ -85,8 +86,9 @@ def test_pairing_by_scene_narrows_the_interval_of_a_difference():
     assert opposite.difference == pytest.approx(-found.difference) and opposite.improvement == 1 - found.improvement
 
 
-def test_no_difference_is_called_one_about_as_often_as_it_should_be():
-    generator, times = np.random.default_rng(3), 80
+def test_no_difference_is_called_one_about_as_often_as_it_should_be(monkeypatch):
+    monkeypatch.setattr(aggregates, "DRAWS", 300)
+    generator, times = np.random.default_rng(3), 150
     called = 0
     for _ in range(times):
         a, b = (draw(generator, seeds=4, scenes=100, rate=0.7, between=0.05) for _ in range(2))
