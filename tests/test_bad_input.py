@@ -50,7 +50,7 @@ COMMAND_LINES = [
     (
         "pregrasp_jax dokter",
         "Unrecognized options: dokter (Available subcommands: assets, compare, demo, doctor, evaluate, ",
-        "scenes, show, train)",
+        "scenes, show, sweep, train)",
     ),
     ("pregrasp_jax demo --episodes 0 --run-dir {w}/new", "episodes = 0 is out of range; allowed is 1 and more"),
     ("pregrasp_jax show --pushes -1", "pushes = -1 is out of range; allowed is 0 and more"),
