@@ -73,6 +73,8 @@ class Worker:
 
     def run(self) -> int:
         """Return the exit code: 0 done or at the rung, 1 failed, 2 refused, 143 stopped, or `BUSY`, `UNWRITTEN`."""
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._ask_to_stop)
         try:
             with self.folder.hold(self.trial, patience=PATIENCE) as self._lock_fd:
                 now = next(s for s in self.folder.states() if s.trial.id == self.trial.id)
@@ -86,8 +88,6 @@ class Worker:
             return BUSY
 
     def _session(self, trained: bool) -> int:
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._ask_to_stop)
         if self._cores and hasattr(os, "sched_setaffinity"):
             os.sched_setaffinity(0, self._cores)
         start = time.monotonic()
