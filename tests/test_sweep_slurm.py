@@ -40,13 +40,13 @@ def test_what_slurm_cannot_do_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     folder, spec = begin(tmp_path)
     with pytest.raises(ValueError, match="needs sbatch, which is not here"):
-        slurm.submit(folder, spec, parallel=None)
+        slurm.check(spec)
     shared = make_spec(resources={"gpu": 0.5})
     with pytest.raises(ValueError, match=r"resources.gpu = 0.5: SLURM shares no GPU between tasks"):
-        slurm.submit(folder, shared, parallel=None)
+        slurm.check(shared)
     learning = make_spec(search={"method": "tpe", "trials": 3})
     with pytest.raises(ValueError, match="needs a driver that lives as long as the sweep"):
-        slurm.submit(folder, learning, parallel=None)
+        slurm.check(learning)
     with pytest.raises(ValueError, match="there is no trial 9; allowed is 0 to 1"):
         slurm.trial_of(folder, spec, 9, rung=None, final=False)
 

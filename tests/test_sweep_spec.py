@@ -2,6 +2,7 @@
 
 import random
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -260,3 +261,24 @@ def test_the_sweep_of_the_docs_can_be_started(tmp_path):
     spec = read_spec(tmp_path / "spec.yaml")
     checks.check(spec)
     assert {key for key in spec.__dataclass_fields__ if f"`{key}`" in text} == set(spec.__dataclass_fields__)
+
+
+@pytest.mark.parametrize(
+    ("module", "keys", "options", "said"),
+    [
+        ("optuna", {"search": {"method": "tpe", "trials": 3}, "stop": None}, [], "pregrasp_jax[sweep]"),
+        ("ray", {}, ["--launcher", "ray"], "pregrasp_jax[ray]"),
+        ("ray", {}, ["--launcher", "slurm"], "needs sbatch"),
+    ],
+)
+def test_what_is_not_installed_is_said_before_anything_is_written(
+    module, keys, options, said, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    (tmp_path / "spec.yaml").write_bytes(yaml_file.dump(changed(**keys)))
+    with pytest.raises(SystemExit) as exit_info:
+        main(["sweep", "start", str(tmp_path / "spec.yaml"), "--dir", str(tmp_path / "sweep"), *options])
+    error = capsys.readouterr().err
+    assert exit_info.value.code == 2 and said in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "sweep").exists()

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from pregrasp_jax.cli.sweep import LauncherName, drive
-from pregrasp_jax.sweep import checks, experiments
+from pregrasp_jax.cli.sweep import LauncherName, check, drive
+from pregrasp_jax.sweep import experiments
 from pregrasp_jax.sweep.estimate import describe
 from pregrasp_jax.sweep.experiments import Experiment
 from pregrasp_jax.sweep.folder import CHANGEABLE, SPEC, SweepFolder
@@ -58,11 +58,7 @@ def reproduce(
     path = dir or Path("runs/reproduce") / (experiment.runs if size == "budget" else f"{experiment.runs}-{size}")
     if only_page:
         return _write_page(path, experiment)
-    checks.check(spec)
-    if dry_run:
-        from pregrasp_jax.sweep.names import check_names
-
-        check_names(spec)
+    check(spec, launcher=launcher, names=dry_run)
     for line in describe(spec, launcher=launcher, parallel=parallel):
         print(line, flush=True)
     if dry_run:

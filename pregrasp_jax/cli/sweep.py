@@ -8,12 +8,14 @@ from typing import Literal
 
 from pregrasp_jax import io
 from pregrasp_jax.cli.command_line import deferred
-from pregrasp_jax.sweep import checks, driver, table
+from pregrasp_jax.sweep import checks, driver, slurm, table
 from pregrasp_jax.sweep.driver import Driver
 from pregrasp_jax.sweep.estimate import describe, memory_of
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.launchers import Launcher, LocalLauncher
-from pregrasp_jax.sweep.spec import Spec, read_spec
+from pregrasp_jax.sweep.ray_launcher import RayLauncher, require_ray
+from pregrasp_jax.sweep.spec import PROGRAM, Spec, read_spec
+from pregrasp_jax.sweep.study import require_optuna
 from pregrasp_jax.sweep.table_files import format_table, to_dict, write_table
 from pregrasp_jax.sweep.worker import Worker
 
@@ -47,13 +49,10 @@ def start(
         dry_run: check everything, say what would be done, and do nothing.
     """
     read = read_spec(spec)
-    checks.check(read)
+    check(read, launcher=launcher, names=dry_run)
     for line in describe(read, launcher=launcher, parallel=parallel):
         print(line, flush=True)
     if dry_run:
-        from pregrasp_jax.sweep.names import check_names
-
-        check_names(read)
         return 0
     return drive(SweepFolder.create(dir, read), read, launcher=launcher, parallel=parallel)
 
@@ -71,7 +70,7 @@ def resume(
     """
     opened = SweepFolder.open(folder)
     spec = opened.spec()
-    checks.check(spec)
+    check(spec, launcher=launcher)
     opened.ask_to_stop(False)
     for failed in [s for s in opened.states() if retry and s.failed]:
         opened.append({"event": "retry", "id": failed.trial.id})
@@ -157,8 +156,6 @@ def worker(
         final: plan the fresh seeds of the winners if that was not done.
         cores: those that the trial may use; all if left out.
     """
-    from pregrasp_jax.sweep import slurm
-
     opened = SweepFolder.open(folder)
     spec = opened.spec()
     trial = slurm.trial_of(opened, spec, task, rung=rung, final=final)
@@ -169,6 +166,30 @@ def worker(
     return code
 
 
+def check(spec: Spec, *, launcher: LauncherName, names: bool = False) -> None:
+    """Refuse what cannot work, before anything is written.
+
+    Args:
+        spec: of the sweep.
+        launcher: its own needs are looked at, too.
+        names: whether to check those that only the registries know, which takes JAX.
+
+    Raises:
+        ValueError: one line says what, where, and what is allowed.
+    """
+    checks.check(spec)
+    if spec.search.method == "tpe":
+        require_optuna()
+    if launcher == "ray":
+        require_ray()
+    elif launcher == "slurm":
+        slurm.check(spec)
+    if names and spec.program == PROGRAM:
+        from pregrasp_jax.sweep.names import check_names
+
+        check_names(spec)
+
+
 def drive(folder: SweepFolder, spec: Spec, *, launcher: LauncherName, parallel: int | None) -> int:
     """Drive a sweep to its end and write its table and page; a sweep of SLURM is only handed over.
 
@@ -176,8 +197,6 @@ def drive(folder: SweepFolder, spec: Spec, *, launcher: LauncherName, parallel: 
         The exit code, see `Driver.run`.
     """
     if launcher == "slurm":
-        from pregrasp_jax.sweep import slurm
-
         driver.plan(folder, spec)
         for line in slurm.submit(folder, spec, parallel=parallel):
             print(line)
@@ -194,8 +213,6 @@ def drive(folder: SweepFolder, spec: Spec, *, launcher: LauncherName, parallel: 
 
 def _launcher(folder: SweepFolder, spec: Spec, name: LauncherName, parallel: int | None) -> Launcher:
     if name == "ray":
-        from pregrasp_jax.sweep.ray_launcher import RayLauncher
-
         return RayLauncher(folder, spec, parallel=parallel)
     return LocalLauncher(folder, spec, parallel=parallel, memory=memory_of(spec))
 

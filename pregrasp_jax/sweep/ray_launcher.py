@@ -1,5 +1,6 @@
 """Ray: workers as tasks of a cluster, which places them; everything else is as on one machine (extra `ray`)."""
 
+import importlib.util
 import logging
 import os
 import subprocess
@@ -13,6 +14,16 @@ from pregrasp_jax.sweep.state import Job
 
 LOST = -1
 """Exit code of a worker whose node is gone."""
+
+
+def require_ray() -> None:
+    """Refuse a cluster without the package.
+
+    Raises:
+        ValueError: it is not installed.
+    """
+    if importlib.util.find_spec("ray") is None:
+        raise ValueError("--launcher ray needs ray, which is not installed; allowed is pip install 'pregrasp_jax[ray]'")
 
 
 class RayLauncher:
@@ -30,12 +41,9 @@ class RayLauncher:
         Raises:
             ValueError: ray is not installed, or not even one trial fits.
         """
-        try:
-            import ray
-        except ModuleNotFoundError:
-            raise ValueError(
-                "--launcher ray needs ray, which is not installed; allowed is pip install 'pregrasp_jax[ray]'"
-            ) from None
+        require_ray()
+        import ray
+
         self._ray, self._folder = ray, folder
         self._own = not ray.is_initialized()
         if self._own:

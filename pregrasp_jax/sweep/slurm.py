@@ -5,6 +5,7 @@ A task finds its trial by its number and its run folder by that, so that a reque
 
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -26,11 +27,11 @@ MOST_REQUEUES = 50
 _STOPPED = 143
 
 
-def submit(folder: SweepFolder, spec: Spec, *, parallel: int | None) -> list[str]:
-    """Write the arrays, hand them to sbatch, and return one line for each.
+def check(spec: Spec) -> None:
+    """Refuse a sweep that SLURM cannot do.
 
     Raises:
-        ValueError: sbatch is not there, or refuses; or the sweep needs a driver that lives as long as it does.
+        ValueError: sbatch is not here; or the sweep needs a driver that lives as long as it does, or parts of a GPU.
     """
     if spec.search.method == "tpe":
         raise ValueError(
@@ -40,6 +41,16 @@ def submit(folder: SweepFolder, spec: Spec, *, parallel: int | None) -> list[str
         raise ValueError(
             f"resources.gpu = {spec.resources.gpu:g}: SLURM shares no GPU between tasks; allowed is 0 or a whole number"
         )
+    if shutil.which("sbatch") is None:
+        raise ValueError("--launcher slurm needs sbatch, which is not here; allowed is a host that can submit jobs")
+
+
+def submit(folder: SweepFolder, spec: Spec, *, parallel: int | None) -> list[str]:
+    """Write the arrays, hand them to sbatch, and return one line for each.
+
+    Raises:
+        ValueError: sbatch refuses.
+    """
     count, said, previous = len(folder.states()), [], ""
     stages: list[tuple[str, int, list[str]]] = [
         (f"rung-{rung}", count, ["--rung", str(rung)]) for rung in state.rungs(spec)
@@ -85,10 +96,6 @@ def _sbatch(script: Path, after: str) -> str:
         done = subprocess.run(
             ["sbatch", "--parsable", *options, str(script)], capture_output=True, text=True, check=True
         )
-    except FileNotFoundError:
-        raise ValueError(
-            "--launcher slurm needs sbatch, which is not here; allowed is a host that can submit"
-        ) from None
     except subprocess.CalledProcessError as error:
         said = " ".join(error.stderr.split())
         raise ValueError(f"sbatch refuses {script}: {said}; the key slurm of the spec takes further options") from None
