@@ -1,5 +1,8 @@
 """Ray: a real cluster of two CPUs on this machine places the workers of a sweep (extra `ray`)."""
 
+import logging
+import os
+import tempfile
 from collections import Counter
 
 import pytest
@@ -14,21 +17,20 @@ from pregrasp_jax.sweep.ray_launcher import RayLauncher  # noqa: E402
 
 
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory):
-    import os
-
+def cluster():
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    ray.init(
-        num_cpus=2,
-        include_dashboard=False,
-        log_to_driver=False,
-        logging_level=30,
-        object_store_memory=100 * 2**20,
-        _memory=2 * 10**9,
-        _temp_dir="/tmp/ray-pregrasp",  # a socket's path must be short
-    )
-    yield
-    ray.shutdown()
+    with tempfile.TemporaryDirectory(prefix="ray-") as folder:  # pytest's are too long for the path of a socket
+        ray.init(
+            num_cpus=2,
+            include_dashboard=False,
+            log_to_driver=False,
+            logging_level=logging.WARNING,
+            object_store_memory=100 * 2**20,
+            _memory=2 * 10**9,
+            _temp_dir=folder,
+        )
+        yield
+        ray.shutdown()
 
 
 def test_a_sweep_is_pruned_survives_crashes_and_a_lost_worker_and_goes_on(cluster, tmp_path):
