@@ -48,11 +48,31 @@ class SceneConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlaceConfig:
+    """Dimensions of the place; null is its own. One that it does not have is refused."""
+
+    half_width: float | None = None
+    """m, from the middle to the side walls of `shelf`, or to where the table ends in `narrow`."""
+    back: float | None = None
+    """m, x of the inner face of the back wall of `shelf`."""
+    front: float | None = None
+    """m, x where the side walls of `shelf` begin and objects leave."""
+    wall_height: float | None = None
+    """m."""
+    wall_thickness: float | None = None
+    """m."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TaskConfig:
     """The task of the paper: pushes in a half ring, ten per episode."""
 
     workspace: str = "table"
-    """Where: a name in `spaces.workspace.WORKSPACES`."""
+    """Where: `table`, `shelf`, `narrow` or another name in `spaces.workspace.WORKSPACES` (docs/confined.md)."""
+    place: PlaceConfig = field(default_factory=PlaceConfig)
+    mirrored_start: bool = True
+    """Between walls, start in the mirror image of the arm's posture if the target lies on the right (y < 0), so that
+    the wrist is on the roomier side; False starts in one posture always."""
     robot: str = "ur5e_rg2"
     """Who: a name in `robot.ROBOTS`."""
     primitive: str = "push"
@@ -228,7 +248,10 @@ class TaskOverrides:
     """What an evaluation may change of the task that a policy was trained for; null keeps it."""
 
     workspace: str | None = None
-    """Where: a name in `spaces.workspace.WORKSPACES`."""
+    """Where: `table`, `shelf`, `narrow` or another name in `spaces.workspace.WORKSPACES` (docs/confined.md)."""
+    place: PlaceConfig = field(default_factory=PlaceConfig)
+    mirrored_start: bool | None = None
+    """Between walls, start in the mirror image of the arm's posture if the target lies on the right (y < 0)."""
     robot: str | None = None
     """Who, for scripts: a name in `robot.ROBOTS`. A trained policy knows one robot only."""
     primitive: str | None = None
@@ -270,6 +293,11 @@ _RANGES: dict[str, tuple[float, float]] = {
     "task.r_in": (0.005, 0.5),
     "task.r_out": (0.01, 0.5),
     "task.max_pushes": (1, 100),
+    "task.place.half_width": (0.01, 2.0),
+    "task.place.back": (0.01, 2.0),
+    "task.place.front": (-2.0, 0.0),
+    "task.place.wall_height": (0.01, 2.0),
+    "task.place.wall_thickness": (0.001, 1.0),
     "task.in_region_reward": (0.0, 100.0),
     "task.approach_reward": (0.0, 100.0),
     "task.push_speed": (0.02, 1.0),

@@ -11,7 +11,14 @@ from typing import Any
 import jax
 
 from pregrasp_jax.checkpoint import load_policy
-from pregrasp_jax.config import Config, EvaluationConfig, TaskOverrides, with_absolute_paths
+from pregrasp_jax.config import (
+    Config,
+    EvaluationConfig,
+    PlaceConfig,
+    TaskConfig,
+    TaskOverrides,
+    with_absolute_paths,
+)
 from pregrasp_jax.evaluation import EpisodeCallback, Evaluator, evaluation_document
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.machine import announced_compilation
@@ -150,7 +157,7 @@ def _environment_config(request: EvaluationConfig, trained: Config) -> Config:
         assets=request.assets,
         scene=dataclasses.replace(request.scene, test_scenes=test_scenes),
         physics=request.physics,
-        task=dataclasses.replace(trained.task, **_given(request.task)),
+        task=_task(trained.task, request.task),
     )
     return config.validate()
 
@@ -165,9 +172,16 @@ def _refuse_other_hand(config: Config, trained: Config) -> None:
             )
 
 
-def _given(overrides: TaskOverrides) -> dict[str, Any]:
+def _task(trained: TaskConfig, overrides: TaskOverrides) -> TaskConfig:
+    """Return the task of a policy, changed; another place has dimensions of its own."""
+    elsewhere = overrides.workspace not in (None, trained.workspace)
+    place = dataclasses.replace(PlaceConfig() if elsewhere else trained.place, **_given(overrides.place))
+    return dataclasses.replace(trained, **_given(overrides) | {"place": place})
+
+
+def _given(overrides: TaskOverrides | PlaceConfig) -> dict[str, Any]:
     """Return what is to be changed."""
-    return {name: value for name, value in dataclasses.asdict(overrides).items() if value is not None}
+    return {key: value for key, value in vars(overrides).items() if value is not None}
 
 
 def _make_script(name: str, env: Env, config: Config) -> Policy:

@@ -61,7 +61,7 @@ class Simulations:
         self._threads = threads
         self._lock = threading.Lock()
         self._joint_ids = robot.joint_qpos_ids(model.mj_model)
-        self._set_home = robot.set_home
+        self._robot = robot
         self._record = ("sensordata",) if model.mj_model.nsensordata else ()
         self._allocate(1)
 
@@ -146,14 +146,15 @@ class Simulations:
         qpos, qvel = (state[..., offset : offset + size] for offset, size in parts)
         return qpos, qvel
 
-    def home_state(self) -> np.ndarray:
-        """Return the state [nstate] with the robot at the start and empty slots parked."""
-        mj_model, data = self.model.mj_model, mujoco.MjData(self.model.mj_model)
-        self._set_home(mj_model, data)
-        state = np.zeros(self.state_size)
-        mujoco.mj_getState(mj_model, data, state, _STATE)
-        self.coordinates(state)[0][self.model.slot_qpos_ids] = slot_model.parking_poses()
-        return state
+    def home_states(self) -> np.ndarray:
+        """Return the states [2, nstate] with the robot in the postures of `Robot.homes` and empty slots parked."""
+        states = np.zeros((2, self.state_size))
+        for state, home in zip(states, self._robot.homes, strict=True):
+            mj_model, data = self.model.mj_model, mujoco.MjData(self.model.mj_model)
+            self._robot.set_home(mj_model, data, home=home)
+            mujoco.mj_getState(mj_model, data, state, _STATE)
+            self.coordinates(state)[0][self.model.slot_qpos_ids] = slot_model.parking_poses()
+        return states
 
 
 def _interpolate(ctrl: np.ndarray, num_substeps: int) -> np.ndarray:
@@ -235,9 +236,9 @@ class _Native:
 
     def __init__(self, simulations: Simulations, robot: Robot):
         self._simulations, self._robot = simulations, robot
-        home = simulations.home_state()
-        self._home_bits = _to_bits(home)
-        self._home_joint_pos = simulations.describe(home[None])[1][0]
+        homes = simulations.home_states()
+        self._home_bits = _to_bits(homes)
+        self._home_joint_pos = simulations.describe(homes)[1]
         model = simulations.model.mj_model
         # Where qpos and qvel lie among the numbers of a state.
         self._qpos_ids, self._qvel_ids = simulations.coordinates(np.arange(simulations.state_size))
@@ -247,19 +248,20 @@ class _Native:
         poses = jnp.asarray(slot_model.parking_poses(), jnp.float32)
         return self.reset(None, SceneParams(jnp.full(MAX_OBJECTS, -1, jnp.int32), poses, jnp.int32(0)))
 
-    def reset(self, state: NativeState | None, scene: SceneParams) -> NativeState:
+    def reset(self, state: NativeState | None, scene: SceneParams, mirrored: jax.Array | bool = False) -> NativeState:
         del state
+        posture = jnp.asarray(mirrored, jnp.int32)
         slots = self._qpos_ids[self._simulations.model.slot_qpos_ids]
         return NativeState(
-            bits=self._write(jnp.asarray(self._home_bits), slots, scene.poses),
+            bits=self._write(jnp.asarray(self._home_bits)[posture], slots, scene.poses),
             object_ids=scene.object_ids.astype(jnp.int32),
             object_poses=scene.poses.astype(jnp.float32),
-            joint_pos=jnp.asarray(self._home_joint_pos),
+            joint_pos=jnp.asarray(self._home_joint_pos)[posture],
             diverged=jnp.zeros((), bool),
         )
 
     def place(self, object_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> NativeState:
-        bits = self._write(jnp.asarray(self._home_bits), self._qpos_ids, qpos)
+        bits = self._write(jnp.asarray(self._home_bits)[0], self._qpos_ids, qpos)
         model = self._simulations.model
         return NativeState(
             bits=self._write(bits, self._qvel_ids, qvel),

@@ -55,7 +55,8 @@ class Robot:
         home: [J] joint positions at the start, host array, rad or m.
         links: the bodies that move, and their hulls.
         attach: host; (spec) -> None adds bodies, actuators and constraints to a scene.
-        set_home: host; (mj_model, mj_data) -> None puts the robot at rest at `home`.
+        mirrored_home: [J] the mirror image of that posture in the plane y = 0, host array; None if the robot has none.
+        set_home: host; (mj_model, mj_data, *, home=`home`) -> None puts the robot at rest at joint positions.
         hand_pose: (joint_pos [J]) -> [7] pose of the grasp point in the world, x forward, z up.
         follow: (joint_pos [J], poses [T, 7], apertures [T], workspace) -> controls [T, A] and code [T] int32, for every
             row an index into `OBSTRUCTIONS`: what keeps the hand from that pose. Rows are `types.CTRL_DT` apart.
@@ -70,15 +71,21 @@ class Robot:
     actuators: tuple[str, ...]
     start: HandPose
     home: np.ndarray
+    mirrored_home: np.ndarray | None
     links: Links
     attach: Callable[[mujoco.MjSpec], None]
-    set_home: Callable[[mujoco.MjModel, mujoco.MjData], None]
+    set_home: Callable[..., None]
     hand_pose: Callable[[jax.Array], jax.Array]
     follow: Callable[[jax.Array, jax.Array, jax.Array, Workspace], tuple[jax.Array, jax.Array]]
     clearance: Callable[[jax.Array, Workspace], jax.Array]
     closing_region: Callable[[jax.Array], ClosingRegion] | None
     eligibility: Callable[[HullBank], Eligibility]
     grasp_aperture: float
+
+    @property
+    def homes(self) -> np.ndarray:
+        """The posture at the start and its mirror image, [2, J]; twice the same where there is none."""
+        return np.stack([self.home, self.home if self.mirrored_home is None else self.mirrored_home])
 
     def joint_qpos_ids(self, mj_model: mujoco.MjModel) -> np.ndarray:
         """Return the addresses [J] in qpos of the joints."""

@@ -77,6 +77,7 @@ def make_floating_hand(
         actuators=joints,
         start=start,
         home=home,
+        mirrored_home=home if start.xy[1] == 0 and start.yaw == 0 else None,
         links=links,
         attach=attach,
         set_home=functools.partial(_set_home, links=links, joints=joints, home=home),
@@ -134,10 +135,8 @@ def _follow(
     holds = {
         "joint_limit": ~jnp.all((carrier[:, :3] >= low[None]) & (carrier[:, :3] <= high[None]), axis=-1),
         "table": ~(height >= 0),
+        "wall": clearance.near_walls(links, links.geoms, path, poses, apertures, workspace),
     }
-    if workspace.walls:
-        beside = jax.vmap(lambda q: clearance.distance_to_walls(links, links.geoms, q, workspace))(path)
-        holds["wall"] = ~(beside >= clearance.CLEARANCE_MARGIN)
     lead = jnp.array([kv / kp for kp, kv in (*[_SLIDE_GAINS] * 3, _HINGE_GAINS)])
     velocity = jnp.asarray(jnp.gradient(carrier, CTRL_DT, axis=0))
     return jnp.concatenate([carrier + lead[None] * velocity, fingers], axis=1), first_obstruction(holds)

@@ -32,7 +32,7 @@ MAX_TARGET_WIDTH = 0.105
 def make_robot() -> Robot:
     """Return the robot; reads its MJCF."""
     links = make_links(description.robot_model(), description.JOINTS)
-    home = _home(links)
+    home, mirrored_home = _homes(links)
 
     def clear_of(joint_pos: jax.Array, workspace: Workspace) -> jax.Array:
         table = clearance.height_above_table(links, above_table(links), joint_pos)
@@ -44,6 +44,7 @@ def make_robot() -> Robot:
         actuators=description.ACTUATORS,
         start=START,
         home=home,
+        mirrored_home=mirrored_home,
         links=links,
         attach=description.attach,
         set_home=functools.partial(_set_home, home=home),
@@ -104,25 +105,30 @@ def follow(
     holds = {
         "no_ik": ~solved,
         "joint_limit": ~jnp.all(within, axis=-1),
-        **_too_near(links, path, apertures, workspace),
+        **_too_near(links, path, poses, apertures, workspace),
     }
     lead = jnp.asarray(description.feed_forward()[:6], jnp.float32)[None]
     return jnp.concatenate([path + lead * velocity, apertures[:, None]], axis=1), first_obstruction(holds)
 
 
-def _too_near(links: Links, path: jax.Array, apertures: jax.Array, workspace: Workspace) -> dict[str, jax.Array]:
+def _too_near(
+    links: Links, path: jax.Array, poses: jax.Array, apertures: jax.Array, workspace: Workspace
+) -> dict[str, jax.Array]:
     """Return [T] bool for table and walls: whether arm joints [T, 6] bring the robot nearer than the margin."""
     joints = jnp.concatenate([path, apertures[:, None], apertures[:, None]], axis=1)
     height = jax.vmap(lambda q: clearance.height_above_table(links, above_table(links), q))(joints)
-    found = {"table": ~(height >= clearance.CLEARANCE_MARGIN)}
-    if workspace.walls:
-        beside = jax.vmap(lambda q: clearance.distance_to_walls(links, moving(links), q, workspace))(joints)
-        found["wall"] = ~(beside >= clearance.CLEARANCE_MARGIN)
-    return found
+    return {
+        "table": ~(height >= clearance.CLEARANCE_MARGIN),
+        "wall": clearance.near_walls(links, moving(links), joints, poses, apertures, workspace),
+    }
 
 
-def _home(links: Links) -> np.ndarray:
-    """Return joint positions [8] at the start, rad: the least bent of the solutions that keep clear of the table."""
+def _homes(links: Links) -> tuple[np.ndarray, np.ndarray]:
+    """Return joint positions [8] at the start, rad, and their mirror image in the plane y = 0, in which the start lies.
+
+    The first is the least bent of the solutions that keep clear of the table. In its mirror image shoulder, wrist and
+    elbow are on the other side.
+    """
 
     @jax.jit
     def solve(pose: jax.Array) -> jax.Array:
@@ -130,9 +136,11 @@ def _home(links: Links) -> np.ndarray:
         joints = jnp.concatenate([solutions, jnp.full((len(solutions), 2), FINGER_OPEN)], axis=1)
         height = jax.vmap(lambda q: clearance.height_above_table(links, above_table(links), q))(joints)
         clear = height > clearance.CLEARANCE_MARGIN
-        return solutions[jnp.argmin(jnp.where(clear, jnp.linalg.norm(solutions, axis=-1), jnp.inf))]
+        branch = jnp.argmin(jnp.where(clear, jnp.linalg.norm(solutions, axis=-1), jnp.inf))
+        return joints[jnp.stack([branch, len(solutions) - 1 - branch])]
 
-    return np.append(solve(_pose(START)), [FINGER_OPEN, FINGER_OPEN]).astype(np.float32)
+    home, mirrored_home = np.asarray(solve(_pose(START)), np.float32)
+    return home, mirrored_home
 
 
 def _pose(hand: HandPose) -> np.ndarray:

@@ -139,7 +139,7 @@ class Env:
     def start(self, scene: SceneParams, index: jax.Array | int = -1) -> EnvState:
         """Return any scene with the hand at the start; `index` is its row of the bank, -1 for none."""
         blank = jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8)
-        physics = self.engine.reset(self.engine.init(), scene)
+        physics = self.engine.reset(self.engine.init(), scene, self._starts_mirrored(scene))
         hand = jax.tree.map(jnp.asarray, self.robot.start)
         state = EnvState(
             physics=physics,
@@ -151,6 +151,13 @@ class Env:
             num_pushes=jnp.int32(0),
         )
         return self.look(state, hand)
+
+    def _starts_mirrored(self, scene: SceneParams) -> jax.Array | bool:
+        """Return () bool, whether the arm starts in the mirror image of its posture; see `TaskConfig.mirrored_start`.
+
+        The mirror image of a scene then starts with the mirror image of the arm.
+        """
+        return bool(self.task.mirrored_start and self.workspace.walls) and scene.poses[scene.target, 1] < 0
 
     def _scene(self, index: jax.Array, yaw: jax.Array, target: jax.Array) -> SceneParams:
         """Return scene `index` of the bank turned by `yaw` about the centre."""
@@ -189,7 +196,7 @@ def make_env(
     """
     startup.check()
     threads = config.physics.threads if threads is None else threads
-    refuse_walls(get_robot(config.task.robot), get_workspace(config.task.workspace))
+    refuse_walls(get_robot(config.task.robot), place_of(config.task))
     registry.get_kind(config.task.primitive)  # before anything is packed
     bank = load_bank_for(config.assets.object_dir, config.assets.object_set)
     eligible = eligible_targets(get_robot(config.task.robot), bank, origin=str(config.assets.object_dir or "built in"))
@@ -209,7 +216,7 @@ def assemble(
         eligible: [N] bool, from `eligible_targets`, where that is known.
         threads: of the native engine; 0 takes every core.
     """
-    robot, workspace = get_robot(config.task.robot), get_workspace(config.task.workspace)
+    robot, workspace = get_robot(config.task.robot), place_of(config.task)
     refuse_walls(robot, workspace)
     eligible = eligible_targets(robot, bank) if eligible is None else eligible
     reach = longest_push(config)
@@ -257,6 +264,11 @@ def make_task(
     return primitive, kind.make_rules(robot, workspace, primitive, bank, task)
 
 
+def place_of(task: TaskConfig) -> Workspace:
+    """Return the place of a task, in the dimensions that it asks for."""
+    return get_workspace(task.workspace, dataclasses.asdict(task.place))
+
+
 def refuse_walls(robot: Robot, workspace: Workspace) -> None:
     """Refuse a place whose walls are where the robot starts or where scenes are packed.
 
@@ -271,7 +283,7 @@ def refuse_walls(robot: Robot, workspace: Workspace) -> None:
                 f"workspace '{workspace.name}': wall {index} comes within {reach:.3f} m of the centre, where scenes "
                 f"are packed; allowed is {MAX_RADIUS} m or more"
             )
-        clear = float(robot.clearance(jnp.asarray(robot.home), alone))
+        clear = min(float(robot.clearance(jnp.asarray(home), alone)) for home in robot.homes)
         if clear < CLEARANCE_MARGIN:
             raise ValueError(
                 f"workspace '{workspace.name}': wall {index} is {clear:.3f} m from robot {robot.name} at its start "
