@@ -43,9 +43,10 @@ REASONS = (
 )
 """Why an episode ended; an integer reason indexes this tuple, earlier entries win."""
 
-OBSTRUCTIONS = ("none", "no_ik", "joint_limit", "table", "wall", "too_long", "end_error")
+OBSTRUCTIONS = ("none", "no_ik", "joint_limit", "table", "wall", "too_long", "end_error", "jammed")
 """What keeps a hand from where it is sent: no joint solution, a joint's limit of angle or speed, an arm link too near
-to the table or to a wall, a motion longer than was planned for, or (after the motion) a final error above 10 mm."""
+to the table or to a wall, a motion longer than was planned for; or, after the motion, a final error above 10 mm, or
+objects pressed into each other or into a wall."""
 
 
 class HandPose(struct.PyTreeNode):
