@@ -29,7 +29,7 @@ from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training import collect, learn
 from pregrasp_jax.training.run_folder import RunFolder, stored_config
 from pregrasp_jax.training.trainer import Trainer
-from pregrasp_jax.types import REASONS, EnvState, StepResult
+from pregrasp_jax.types import OBSTRUCTIONS, REASONS, EnvState, StepResult
 
 
 @pytest.fixture(scope="module")
@@ -269,18 +269,25 @@ def test_tally_keeps_the_reasons_of_the_last_episodes():
         overflowed=jnp.int32(0),
         diverged=jnp.int32(0),
         reasons=jnp.zeros(len(REASONS), jnp.int32),
+        obstructions=jnp.zeros(len(OBSTRUCTIONS), jnp.int32),
     )
     success, truncated = REASONS.index("target_in_region"), REASONS.index("truncated")
-    pushes = [([success, 0, truncated], [1, 0, 1]), ([0, success, success], [0, 1, 1]), ([truncated, 0, 0], [1, 0, 0])]
+    stopped, wall, error = REASONS.index("unreachable"), OBSTRUCTIONS.index("wall"), OBSTRUCTIONS.index("end_error")
+    pushes = [([success, 0, truncated], [1, 0, 1]), ([0, success, success], [0, 1, 1]), ([stopped, 0, 0], [1, 0, 0])]
     for reason, ended in pushes:
-        results: Any = SimpleNamespace(reason=jnp.array(reason), reward=jnp.ones(3))
+        # A physics failure goes before what stopped the hand: only the reason tells.
+        outcome = SimpleNamespace(obstruction=jnp.array([wall if reason[0] == stopped else 0, 0, error]))
+        results: Any = SimpleNamespace(reason=jnp.array(reason), reward=jnp.ones(3), outcome=outcome)
         random, overflowed = jnp.array([True, False, False]), jnp.array([reason[0] == success, False, True])
         diverged = jnp.array([False, False, False, reason[1] == success, True])  # with a branch of two scenes
         tally = collect._count(tally, results, jnp.array(ended, bool), random, overflowed, diverged)
     report = collect.metrics(tally, (success,))
     assert report["train/success_rate"] == 0.5, "the first success has left the window of four"
     assert (report["episodes"], report["env_steps"]) == (5, 9)
-    assert (report["reasons/target_in_region"], report["reasons/truncated"]) == (3, 2)
+    assert (report["reasons/target_in_region"], report["reasons/truncated"]) == (3, 1)
+    assert {name: report[f"unreachable/{name}"] for name in OBSTRUCTIONS[1:] if report[f"unreachable/{name}"]} == {
+        "wall": 1
+    }
     assert report["train/explored"] == pytest.approx(1 / 3) and report["train/episode_length"] == pytest.approx(9 / 5)
     assert report["physics/overflows"] == 4, "one in the first scene, three in the last"
     assert report["physics/diverged"] == 4, "one in one branch, three in the last"

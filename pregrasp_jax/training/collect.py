@@ -24,7 +24,7 @@ from pregrasp_jax.task.rules import Rules
 from pregrasp_jax.task.stages import Stages, make_stages
 from pregrasp_jax.training.mishap import Mishap, no_mishap
 from pregrasp_jax.training.sharding import VmapFn
-from pregrasp_jax.types import REASONS, EnvState, HandPose, StepResult
+from pregrasp_jax.types import OBSTRUCTIONS, REASONS, EnvState, HandPose, StepResult
 
 RECENT_EPISODES = 200
 """Episodes behind `train/success_rate`, or one per scene where there are more scenes."""
@@ -82,6 +82,7 @@ class Tally(struct.PyTreeNode):
         overflowed: () int32 pushes since the last report, branches included, in which the engine dropped contacts.
         diverged: () int32 pushes since the last report, branches included, after which the physics made no sense.
         reasons: [len(REASONS)] int32 why episodes ended since the last report.
+        obstructions: [len(OBSTRUCTIONS)] int32 what made the last push of those unreachable that ended so.
     """
 
     env_steps: jax.Array
@@ -93,6 +94,7 @@ class Tally(struct.PyTreeNode):
     overflowed: jax.Array
     diverged: jax.Array
     reasons: jax.Array
+    obstructions: jax.Array
 
     def begin_report(self) -> "Tally":
         """Return the tally with the counts since the last report at 0."""
@@ -103,6 +105,7 @@ class Tally(struct.PyTreeNode):
             overflowed=jnp.zeros_like(self.overflowed),
             diverged=jnp.zeros_like(self.diverged),
             reasons=jnp.zeros_like(self.reasons),
+            obstructions=jnp.zeros_like(self.obstructions),
         )
 
 
@@ -153,6 +156,7 @@ def init_actors(key: jax.Array, env: Environment, num_envs: int, *, vmap: VmapFn
         overflowed=jnp.int32(0),
         diverged=jnp.int32(0),
         reasons=jnp.zeros(len(REASONS), jnp.int32),
+        obstructions=jnp.zeros(len(OBSTRUCTIONS), jnp.int32),
     )
     states = vmap(env.reset)(jax.random.split(reset_key, num_envs))
     return Actors(states, key, tally, no_mishap(states))
@@ -283,6 +287,7 @@ def _count(
 ) -> Tally:
     window = tally.recent.shape[0]
     order = jnp.cumsum(ended, dtype=jnp.int32) - 1
+    unreachable = ended & (results.reason == REASONS.index("unreachable"))
     slots = jnp.where(ended, (tally.episodes + order) % window, window)
     return Tally(
         env_steps=tally.env_steps + ended.shape[0],
@@ -294,6 +299,7 @@ def _count(
         overflowed=tally.overflowed + jnp.sum(overflowed, dtype=jnp.int32),
         diverged=tally.diverged + jnp.sum(diverged, dtype=jnp.int32),
         reasons=tally.reasons.at[results.reason].add(ended.astype(jnp.int32)),
+        obstructions=tally.obstructions.at[results.outcome.obstruction].add(unreachable.astype(jnp.int32)),
     )
 
 
@@ -317,4 +323,9 @@ def metrics(tally: Tally, successes: Sequence[int]) -> dict[str, Any]:
         "physics/overflows": int(counts.overflowed),
         "physics/diverged": int(counts.diverged),
         **{f"reasons/{name}": int(n) for name, n in zip(REASONS, counts.reasons, strict=True) if name != "running"},
+        **{
+            f"unreachable/{name}": int(n)
+            for name, n in zip(OBSTRUCTIONS, counts.obstructions, strict=True)
+            if name != "none"
+        },
     }

@@ -124,15 +124,15 @@ class RunFolder:
         """Record configuration, versions, machine and hashes; call it before anything else is written.
 
         Raises:
-            ValueError: the run began with other objects or scenes, or its manifest is damaged.
+            ValueError: the run began with other objects or scenes or in another place, or its manifest is damaged.
         """
         manifest = read_manifest(self.path) or {"hashes": hashes, "sessions": []}
         then = manifest["hashes"]
-        for name in then | hashes:
-            if then.get(name) != hashes.get(name):
+        for name in then:  # an earlier version may have recorded fewer
+            if then[name] != hashes.get(name):
                 raise ValueError(
-                    f"run {self.path} began with another {name} ({then.get(name)}, now {hashes.get(name)}); resume it "
-                    "with the same objects, MuJoCo and package version; --init-from starts a new run from its "
+                    f"run {self.path} began with another {name} ({then[name]}, now {hashes.get(name)}); resume it "
+                    "with the same objects, place, MuJoCo and package version; --init-from starts a new run from its "
                     "parameters"
                 )
         if difference(stored_config(self.path), config):

@@ -174,4 +174,5 @@ def _hashes(env: Env, validation: Env) -> dict[str, str]:
         "hull bank": env.bank.content_hash,
         "training scenes": env.scenes.content_hash,
         "validation scenes": validation.scenes.content_hash,
+        "workspace": env.workspace.content_hash,
     }
