@@ -128,10 +128,10 @@ class RunFolder:
         """
         manifest = read_manifest(self.path) or {"hashes": hashes, "sessions": []}
         then = manifest["hashes"]
-        for name in then:  # an earlier version may have recorded fewer
-            if then[name] != hashes.get(name):
+        for name in then | hashes:
+            if then.get(name) != hashes.get(name):
                 raise ValueError(
-                    f"run {self.path} began with another {name} ({then[name]}, now {hashes.get(name)}); resume it "
+                    f"run {self.path} began with another {name} ({then.get(name)}, now {hashes.get(name)}); resume it "
                     "with the same objects, place, MuJoCo and package version; --init-from starts a new run from its "
                     "parameters"
                 )
