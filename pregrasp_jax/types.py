@@ -198,11 +198,13 @@ class GraspResult(struct.PyTreeNode):
         held: () bool, the target was lifted and stayed between the fingers.
         diverged: () bool, as in `PhysicsObservation`.
         overflows: () int32, as in `PhysicsObservation`, the pushes before the grasp included.
+        obstruction: () int32 index into `OBSTRUCTIONS`, what kept it from being tried.
     """
 
     held: jax.Array
     diverged: jax.Array
     overflows: jax.Array
+    obstruction: jax.Array
 
 
 class EnvState(struct.PyTreeNode):

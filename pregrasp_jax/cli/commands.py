@@ -62,16 +62,17 @@ def assets(
             _write_image(file, contact_sheet(loaded.bank, eligible))
 
 
-def compare(a: Path, b: Path, /, *, json: Path | None = None) -> None:
+def compare(a: Path, b: Path, /, *, across_workspaces: bool = False, json: Path | None = None) -> None:
     """Compare two evaluations on the same scenes: intervals, and McNemar's exact test of their difference.
 
     Args:
         a: file written by `pregrasp-jax evaluate --json`.
         b: another, of the same scenes.
+        across_workspaces: the two may be of different places, as the open table and a shelf.
         json: write the comparison here.
     """
     refuse_unwritable(json, "json")
-    comparison = compare_evaluations(load_evaluation(a), load_evaluation(b))
+    comparison = compare_evaluations(load_evaluation(a), load_evaluation(b), across_workspaces=across_workspaces)
     print(format_comparison(comparison))
     if json:
         io.write_json(json, comparison.to_dict())

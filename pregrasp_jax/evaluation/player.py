@@ -125,6 +125,7 @@ def run_evaluation(
         seed=request.seed,
         hull_bank_hash=player.env.bank.content_hash,
         scene_bank_hash=player.env.scenes.content_hash,
+        workspace_hash=player.env.workspace.content_hash,
         wall_seconds=time.monotonic() - start,
     )
 

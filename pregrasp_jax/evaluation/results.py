@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 
 from pregrasp_jax import io
 from pregrasp_jax.config import Config, to_dict
-from pregrasp_jax.evaluation.statistics import is_interval, is_number, wilson_interval
+from pregrasp_jax.evaluation.statistics import is_interval, is_number, wilson_interval, workspace_of
 from pregrasp_jax.machine import versions
 
 FORMAT = "pregrasp_jax evaluation 1"
@@ -38,6 +39,7 @@ class Episode:
         return_: sum of rewards, undiscounted.
         seconds: s, time the robot spent on its motions.
         overflows: physics steps in which the engine had no room for every contact.
+        obstruction: what kept the hand from where it was sent last, of `types.OBSTRUCTIONS`.
     """
 
     scene: int
@@ -48,6 +50,7 @@ class Episode:
     return_: float
     seconds: float
     overflows: int = 0
+    obstruction: str = "none"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the row of the evaluation file."""
@@ -55,6 +58,7 @@ class Episode:
             "scene": self.scene,
             "target": self.target,
             "reason": self.reason,
+            "obstruction": self.obstruction,
             "success": self.success,
             "motions": self.motions,
             "return": round(self.return_, 4),
@@ -83,6 +87,15 @@ class EvaluationResult:
         """Failed episodes by reason, most frequent first."""
         return dict(Counter(episode.reason for episode in self.episodes if not episode.success).most_common())
 
+    @property
+    def obstructions(self) -> dict[str, dict[str, int]]:
+        """What kept the hand from where it was sent in failed episodes, by reason and then by obstruction."""
+        found: dict[str, Counter[str]] = {}
+        for episode in self.episodes:
+            if not episode.success and episode.obstruction != "none":
+                found.setdefault(episode.reason, Counter())[episode.obstruction] += 1
+        return {reason: dict(counts.most_common()) for reason, counts in found.items()}
+
     def summary(self) -> dict[str, Any]:
         """Return the measured keys of the evaluation file, without rows.
 
@@ -100,6 +113,7 @@ class EvaluationResult:
             "std_motions": float(np.std(motions)) if motions else None,
             "mean_return": sum(episode.return_ for episode in self.episodes) / total,
             "failures": self.failures,
+            "obstructions": self.obstructions,
             "overflows": sum(episode.overflows > 0 for episode in self.episodes),
             "seconds_per_motion": sum(e.seconds for e in self.episodes) / executed if executed else None,
         }
@@ -113,6 +127,7 @@ def evaluation_document(
     seed: int,
     hull_bank_hash: str,
     scene_bank_hash: str,
+    workspace_hash: str,
     wall_seconds: float,
 ) -> dict[str, Any]:
     """Return the content of an evaluation file (`pregrasp-jax evaluate --json`).
@@ -124,6 +139,7 @@ def evaluation_document(
         seed: of the policy's randomness.
         hull_bank_hash: which objects.
         scene_bank_hash: which scenes; two files can be paired only if both hashes agree.
+        workspace_hash: which place; files of two places are paired only when that is asked for.
         wall_seconds: s, how long the evaluation took on this machine, compilation included.
     """
     return {
@@ -142,6 +158,7 @@ def evaluation_document(
         "config_hash": io.content_hash(to_dict(config)),
         "hull_bank_hash": hull_bank_hash,
         "scene_bank_hash": scene_bank_hash,
+        "workspace_hash": workspace_hash,
         "versions": versions(),
         "config": to_dict(config),
         "rows": [episode.to_dict() for episode in result.episodes],
@@ -178,6 +195,9 @@ def _damaged_keys(document: dict[str, Any]) -> list[str]:
     good["success_ci95"] = is_interval(interval)
     good["mean_motions"] = motions == [None, None] or all(map(is_number, motions))
     good["failures"] = isinstance(document.get("failures"), dict)
+    good["workspace"], good["workspace_hash"] = (
+        isinstance(document.get(key, ""), str) for key in ("workspace", "workspace_hash")
+    )
     good["rows"] = isinstance(rows, list) and len(rows) > 0 and all(map(_is_row, rows))
     good["config"] = isinstance(config, dict) and isinstance(config.get("task", {}), dict)
     return [key for key, is_good in good.items() if not is_good]
@@ -199,13 +219,22 @@ def format_evaluation(document: dict[str, Any]) -> str:
         "motions": _spread(document["mean_motions"], document["std_motions"]),
         "robot time": _maybe(document["seconds_per_motion"], "{:.2f} s per motion"),
         "mean return": f"{document['mean_return']:.2f}",
-        "failures": ", ".join(f"{reason} {count}" for reason, count in document["failures"].items()) or "none",
+        "failures": ", ".join(_failures(document)) or "none",
     }
     if document.get("overflows"):
         lines["contacts dropped"] = f"in {document['overflows']} episodes: the limits of the physics engine are too low"
-    settings = f"{document['physics']} physics, {document['camera']} camera, seed {document['seed']}"
+    settings = f"{workspace_of(document)}, {document['physics']} physics, {document['camera']} camera, "
+    settings += f"seed {document['seed']}"
     rows = [f"  {name:<18}{text}" for name, text in lines.items()]
     return "\n".join([f"{title} ({settings}, {document['wall_seconds']:.0f} s)", *rows])
+
+
+def _failures(document: dict[str, Any]) -> Iterator[str]:
+    """Yield reasons with their number, and what was in the way."""
+    for reason, count in document["failures"].items():
+        found = document.get("obstructions", {}).get(reason, {})
+        details = ", ".join(f"{name} {number}" for name, number in found.items())
+        yield f"{reason} {count} ({details})" if details else f"{reason} {count}"
 
 
 def _spread(mean: float | None, std: float | None) -> str:

@@ -20,7 +20,7 @@ from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.task.rules import RUNNING
 from pregrasp_jax.task.stages import Stages, make_stages
-from pregrasp_jax.types import REASONS, EnvState, GraspResult
+from pregrasp_jax.types import OBSTRUCTIONS, REASONS, EnvState, GraspResult
 
 EpisodeCallback = Callable[[int, int, int], None]
 """(episodes ended, episodes in all, successes so far) -> None."""
@@ -36,6 +36,7 @@ class _Run(struct.PyTreeNode):
     Attributes:
         state: where it stands.
         reason: () int32, `RUNNING` until the episode ends.
+        obstruction: () int32 index into `OBSTRUCTIONS`, what kept the hand from the end of the last push.
         return_: () float32, rewards so far.
         seconds: () float32 s, time spent on motions so far.
         action: () int32, the last one decided; -1 before the first.
@@ -43,6 +44,7 @@ class _Run(struct.PyTreeNode):
 
     state: EnvState
     reason: jax.Array
+    obstruction: jax.Array
     return_: jax.Array
     seconds: jax.Array
     action: jax.Array
@@ -214,6 +216,7 @@ class Evaluator:
     def _episode(self, run: _Run, grasp: GraspResult | None = None) -> Episode:
         scene, reason, overflows = run.state.scene, REASONS[int(run.reason)], run.state.physics_obs.overflows
         success = int(run.reason) in self._env.rules.successes
+        obstruction = run.obstruction if grasp is None else grasp.obstruction
         if grasp is not None:
             success = bool(grasp.held)
             if not success:
@@ -228,10 +231,12 @@ class Evaluator:
             return_=float(run.return_),
             seconds=float(run.seconds),
             overflows=int(overflows),
+            obstruction=OBSTRUCTIONS[int(obstruction)],
         )
 
     def _start_one(self, index: jax.Array) -> _Run:
-        return _Run(self._env.reset_to(index), jnp.int32(RUNNING), jnp.float32(0.0), jnp.float32(0.0), jnp.int32(-1))
+        zero, none = jnp.float32(0.0), jnp.int32(OBSTRUCTIONS.index("none"))
+        return _Run(self._env.reset_to(index), jnp.int32(RUNNING), none, zero, zero, jnp.int32(-1))
 
     def _restart_one(self, run: _Run, index: jax.Array) -> _Run:
         """Return scene `index` if it is not negative, else `run`."""
@@ -248,15 +253,20 @@ class Evaluator:
     def _conclude_one(self, run: _Run, plan: Plan, physics: Any) -> _Run:
         """Return the run after a push; an ended run stays as it is."""
         state, result = self._env.conclude(run.state, plan, physics)
-        pushed = _Run(state, result.reason, run.return_ + result.reward, run.seconds + result.seconds, run.action)
+        pushed = run.replace(
+            state=state,
+            reason=result.reason,
+            obstruction=result.outcome.obstruction,
+            return_=run.return_ + result.reward,
+            seconds=run.seconds + result.seconds,
+        )
         return _where(run.reason == RUNNING, pushed, run)
 
     def _plan_grasp_one(self, state: EnvState) -> tuple[Any, Plan, Any]:
         return state.physics, self._env.plan_grasp(state), state
 
     def _conclude_grasp_one(self, state: EnvState, plan: Plan, physics: Any) -> GraspResult:
-        del plan
-        return self._env.conclude_grasp(state, physics)
+        return self._env.conclude_grasp(state, plan, physics)
 
 
 def evaluate_policy(

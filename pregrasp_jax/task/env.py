@@ -130,11 +130,11 @@ class Env:
     def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> GraspResult:
         """Close with constant force, lift 0.2 m, hold 5 s. Without `execute` () bool nothing is held, at no cost."""
         plan = self.plan_grasp(state).unless(~jnp.asarray(execute), "no_ik")
-        return self.conclude_grasp(state, self.engine.run(state.physics, plan.ctrl, plan.num_ctrl))
+        return self.conclude_grasp(state, plan, self.engine.run(state.physics, plan.ctrl, plan.num_ctrl))
 
-    def conclude_grasp(self, state: EnvState, physics: Any) -> GraspResult:
+    def conclude_grasp(self, state: EnvState, plan: Plan, physics: Any) -> GraspResult:
         """Return whether the grasp holds, once `physics` has run through its plan."""
-        return grasp.judge_grasp(self.robot, self.bank, state, self.engine.observe(physics))
+        return grasp.judge_grasp(self.robot, self.bank, state, plan, self.engine.observe(physics))
 
     def start(self, scene: SceneParams, index: jax.Array | int = -1) -> EnvState:
         """Return any scene with the hand at the start; `index` is its row of the bank, -1 for none."""

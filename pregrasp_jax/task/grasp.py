@@ -35,7 +35,7 @@ def plan_grasp(robot: Robot, workspace: Workspace, state: EnvState) -> Plan:
     return follow(robot, workspace, joint_pos, path, num_ctrl=num_ctrl, seconds=jnp.float32(seconds), hand=hand)
 
 
-def judge_grasp(robot: Robot, bank: HullBank, before: EnvState, after: PhysicsObservation) -> GraspResult:
+def judge_grasp(robot: Robot, bank: HullBank, before: EnvState, plan: Plan, after: PhysicsObservation) -> GraspResult:
     """Return whether the target was lifted and is still between the fingers."""
     target = before.scene.target
     rise = after.object_poses[target, 2] - before.physics_obs.object_poses[target, 2]
@@ -43,4 +43,4 @@ def judge_grasp(robot: Robot, bank: HullBank, before: EnvState, after: PhysicsOb
     region = robot.closing_region(before.hand.aperture)
     coverage = scene_coverage(bank, before.scene.object_ids, after.object_poses, after.hand_pose, region)
     held = (rise > _MIN_LIFT) & (coverage[target] > 0) & ~after.diverged
-    return GraspResult(held, after.diverged, after.overflows)
+    return GraspResult(held, after.diverged, after.overflows, plan.obstruction)
