@@ -127,7 +127,7 @@ def make_shelf(
     return Workspace(name="shelf", low=(front, -math.inf), high=(math.inf, math.inf), walls=(across, *sides))
 
 
-def make_narrow(*, half_width: float = 0.20) -> Workspace:
+def make_narrow(*, half_width: float = 0.22) -> Workspace:
     """Return a table that ends early at its sides, |y| = `half_width` m."""
     reach = grid.WORKSPACE_HALF_SIZE
     return Workspace(name="narrow", low=(-reach, -half_width), high=(reach, half_width))

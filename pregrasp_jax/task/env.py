@@ -20,13 +20,12 @@ from pregrasp_jax.physics import make_engine
 from pregrasp_jax.physics.base import Engine
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.robot.base import Robot
-from pregrasp_jax.robot.clearance import CLEARANCE_MARGIN
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.bank import SceneBank, Split
-from pregrasp_jax.scene.packing import MAX_RADIUS
 from pregrasp_jax.spaces import grid
-from pregrasp_jax.spaces.workspace import Workspace, get_workspace
+from pregrasp_jax.spaces.workspace import Workspace
 from pregrasp_jax.task import grasp, registry
+from pregrasp_jax.task.place import place_of, refuse_blocked, refuse_scenes, refuse_walls
 from pregrasp_jax.task.primitive import Plan, Primitive
 from pregrasp_jax.task.rules import Rules
 from pregrasp_jax.types import (
@@ -69,6 +68,15 @@ class Env:
     scenes: SceneBank
     engine: Engine
     max_distance: float
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the mirror image of an episode in the plane y = 0 is an episode of the same task.
+
+        Between walls the arm counts, so that it has to start in its mirror image too.
+        """
+        arm = self.task.mirrored_start and self.robot.mirrored_home is not None
+        return self.workspace.symmetric and (arm or not self.workspace.walls)
 
     def reset(self, key: jax.Array) -> EnvState:
         """Return a random scene of the bank under a random yaw with a random eligible target."""
@@ -220,7 +228,9 @@ def assemble(
     refuse_walls(robot, workspace)
     eligible = eligible_targets(robot, bank) if eligible is None else eligible
     reach = longest_push(config)
+    refuse_scenes(workspace, scenes)
     parts = make_task(config.task, robot, workspace, bank, max_distance=reach)
+    refuse_blocked(robot, workspace, parts[0])
     engine = make_engine(config.physics.engine, bank, robot, workspace, threads=threads)
     return Env(config.task, workspace, robot, *parts, bank, eligible, scenes, engine, reach)
 
@@ -262,33 +272,6 @@ def make_task(
             f"pose (x = {x:g} m, y = {y:g} m); allowed is a ring at least 0.01 m wide that reaches the workspace"
         )
     return primitive, kind.make_rules(robot, workspace, primitive, bank, task)
-
-
-def place_of(task: TaskConfig) -> Workspace:
-    """Return the place of a task, in the dimensions that it asks for."""
-    return get_workspace(task.workspace, dataclasses.asdict(task.place))
-
-
-def refuse_walls(robot: Robot, workspace: Workspace) -> None:
-    """Refuse a place whose walls are where the robot starts or where scenes are packed.
-
-    Raises:
-        ValueError: one line says which wall, and what is allowed.
-    """
-    for index, wall in enumerate(workspace.walls):
-        alone = dataclasses.replace(workspace, walls=(wall,))
-        reach = wall.distance_to_origin()
-        if reach < MAX_RADIUS:
-            raise ValueError(
-                f"workspace '{workspace.name}': wall {index} comes within {reach:.3f} m of the centre, where scenes "
-                f"are packed; allowed is {MAX_RADIUS} m or more"
-            )
-        clear = min(float(robot.clearance(jnp.asarray(home), alone)) for home in robot.homes)
-        if clear < CLEARANCE_MARGIN:
-            raise ValueError(
-                f"workspace '{workspace.name}': wall {index} is {clear:.3f} m from robot {robot.name} at its start "
-                f"pose; allowed is {CLEARANCE_MARGIN} m or more"
-            )
 
 
 def longest_push(config: Config) -> float:

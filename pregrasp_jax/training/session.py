@@ -77,6 +77,7 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
     if jax.device_count() > 1:
         console.say(f"training on {layout.num_devices} of {jax.device_count()} devices")
     env = _load(config, "train", console)
+    refuse_mirror(config, env)
     validation = _load(config, "validation", console)
     program = make_program(env, config, params=params, layout=layout)
     resources.check(*program.shapes().split(), run_dir)
@@ -103,6 +104,26 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
             console.close()
         console.say(ending)
         return interrupt.exit_code or (0 if session.recorder.saved else 1)
+
+
+def refuse_mirror(config: Config, env: Env) -> None:
+    """Refuse to learn from mirror images that are no scenes of the task.
+
+    Raises:
+        ValueError: one line says what breaks the symmetry.
+    """
+    if not config.network.mirror or env.symmetric:
+        return
+    why = (
+        f"robot {env.robot.name} starts in one posture between its walls (task.mirrored_start = "
+        f"{config.task.mirrored_start})"
+        if env.workspace.symmetric
+        else "it is not its own mirror image"
+    )
+    raise ValueError(
+        f"network.mirror = True in workspace '{env.workspace.name}': {why}; allowed is False, also with --init-from, "
+        "whose parameters fit either"
+    )
 
 
 def make_trainer(
