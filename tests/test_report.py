@@ -32,15 +32,31 @@ def test_the_table_shows_the_numbers_of_the_files(run_dir: Path) -> None:
     other.write_text(other.read_text().replace("2.34567", "null").replace('"std_motions": 0.5', '"std_motions": null'))
     run = read_run(run_dir)
     cells = _texts(build_page(run, load_evaluations(run)))
-    table = cells[: cells.index("this run minus it") + 1 + 3 * 9]
-    own, chance, clear = table[9:18], table[18:27], table[27:36]
+    table = cells[: cells.index("this run minus it") + 1 + 3 * 10]
+    own, chance, clear = table[10:20], table[20:30], table[30:40]
     assert own == [
-        *("this run (elsewhere/first)", "seen", "orthographic", "8", "75 %", "12.3 % to 87.7 %", "", "2.35 ± 0.50", "")
+        *("this run (elsewhere/first)", "seen", "table", "orthographic", "8", "75 %", "12.3 % to 87.7 %", ""),
+        *("2.35 ± 0.50", ""),
     ]
-    assert chance[4:] == ["50 %", "12.3 % to 87.7 %", "", "no success", "not on the same scenes"]
+    assert chance[5:] == ["50 %", "12.3 % to 87.7 %", "", "no success", "not on the same scenes"]
     # 6 scenes only this run, 1 only clear: +62.5 points, McNemar 2 (1 + 7) / 2^7 = 0.125.
-    assert clear[0] == "clear" and clear[4] == "12.5 %"
-    assert clear[8].startswith("+62 points (") and clear[8].endswith("p = 0.12")
+    assert clear[0] == "clear" and clear[5] == "12.5 %"
+    assert clear[9].startswith("+62 points (") and clear[9].endswith("p = 0.12")
+
+
+def test_evaluations_in_another_place_are_told_apart(tmp_path: Path) -> None:
+    task = to_dict(PRESETS["ci"].task) | {"workspace": "shelf", "place": {"half_width": 0.25, "back": None}}
+    run_dir = write_run(tmp_path / "first", task=task)
+    there = {"workspace": "shelf", "workspace_hash": "w"}
+    write_evaluation(run_dir / "evaluations" / "a.json", "first", [1, 0], **there)
+    write_evaluation(run_dir / "evaluations" / "b.json", "pretrained", [0, 0])
+    write_evaluation(run_dir / "evaluations" / "c.json", "clear", [0, 0])
+    run = read_run(run_dir)
+    cells = _texts(build_page(run, load_evaluations(run)))
+    assert cells.count("in another place") == 2 and "shelf" in cells
+    lacking = dict(missing(run, load_evaluations(run)))
+    assert "clear on seen objects" in lacking, "it was run on the open table only"
+    assert "--workspace shelf --task.place.half-width 0.25 --json" in lacking["clear on seen objects"]
 
 
 def test_files_named_on_the_command_line_replace_those_of_the_folder(run_dir: Path, tmp_path: Path) -> None:

@@ -116,6 +116,7 @@ def show(
     pushes: int = 0,
     object_dir: str | None = None,
     object_set: ObjectSet = "seen",
+    workspace: str | None = None,
     camera: Literal["orthographic", "pinhole"] | None = None,
     png: Path = Path("scene.png"),
 ) -> None:
@@ -127,6 +128,7 @@ def show(
         pushes: let the policy push so often before the picture is taken.
         object_dir: folder of meshes; the built-in catalogue if left out.
         object_set: objects used in training, or kept for evaluation.
+        workspace: where; the policy's own if left out, the open table for a script.
         camera: what the policy sees through.
         png: the picture; .png, .jpg, .jpeg or .webp.
     """
@@ -134,7 +136,7 @@ def show(
     if pushes < 0:
         raise ValueError(f"pushes = {pushes} is out of range; allowed is 0 and more")
     assets_config = AssetsConfig(object_dir=object_dir, object_set=object_set)
-    task = TaskOverrides(camera=camera)
+    task = TaskOverrides(workspace=workspace, camera=camera)
     player = make_player(EvaluationConfig(policy=policy, assets=assets_config, task=task))
     if not 0 <= scene < len(player.env.scenes):
         raise ValueError(f"scene = {scene} is out of range; allowed is 0 to {len(player.env.scenes) - 1}")

@@ -1,13 +1,13 @@
 """The result table: a run beside the scripts, with intervals, and paired with it where scenes are the same."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.evaluation import load_evaluation
-from pregrasp_jax.evaluation.statistics import compare
+from pregrasp_jax.evaluation.statistics import compare, workspace_of
 from pregrasp_jax.report.markup import Markup, element
 from pregrasp_jax.report.record import RunRecord
 from pregrasp_jax.report.svg import interval_mark
@@ -24,6 +24,7 @@ _EPISODES = 100
 _HEADER = (
     "policy",
     "objects",
+    "place",
     "camera",
     "scenes",
     "success",
@@ -74,9 +75,11 @@ def missing(run: RunRecord, documents: Sequence[dict[str, Any]]) -> list[tuple[s
     """Return what the table lacks, as (what, the command that makes it)."""
     sets = {document["object_set"] for document in documents} or {run.setting("assets", "object_set", "seen")}
     episodes = max((document["episodes"] for document in documents), default=_EPISODES)
+    here = run.setting("task", "workspace", TaskConfig().workspace)
     lacking = []
     for object_set in sorted(sets):
-        present = [document for document in documents if document["object_set"] == object_set]
+        there = [document for document in documents if document["object_set"] == object_set]
+        present = [document for document in there if workspace_of(document) == here]
         names = {document["policy"] for document in present}
         if not of_run(run, present):
             lacking.append((f"this run on {object_set} objects", _command(run, str(run.path), object_set, episodes)))
@@ -100,9 +103,20 @@ def _command(run: RunRecord, policy: str, object_set: str, episodes: int) -> str
     if object_dir := run.setting("assets", "object_dir", None):
         arguments += ["--object-dir", str(object_dir)]
     radius = run.setting("task", "r_out", Config().task.r_out)
-    if policy in BASELINES and radius != TaskConfig().r_out:
-        arguments += ["--r-out", str(radius)]
+    if policy in BASELINES:
+        arguments += ["--r-out", str(radius)] if radius != TaskConfig().r_out else []
+        arguments += list(_place(run))
     return shlex.join(["pregrasp-jax", "evaluate", *arguments, "--json", str(run.path / EVALUATIONS / f"{name}.json")])
+
+
+def _place(run: RunRecord) -> Iterator[str]:
+    """Yield the options that bring a script to the place of a run."""
+    workspace = run.setting("task", "workspace", TaskConfig().workspace)
+    if workspace != TaskConfig().workspace:
+        yield from ("--workspace", workspace)
+    for name, value in run.setting("task", "place", {}).items():
+        if value is not None:
+            yield from (f"--task.place.{name.replace('_', '-')}", str(value))
 
 
 def _row(run: RunRecord, document: dict[str, Any], of_this_run: Sequence[dict[str, Any]]) -> Markup:
@@ -111,6 +125,7 @@ def _row(run: RunRecord, document: dict[str, Any], of_this_run: Sequence[dict[st
     name = element("strong", f"this run ({document['policy']})") if own else document["policy"]
     cells = [
         document["object_set"],
+        workspace_of(document),
         document["camera"],
         str(document["episodes"]),
         percent(document["success_rate"]),
@@ -139,7 +154,10 @@ def _paired(of_this_run: Sequence[dict[str, Any]], other: dict[str, Any]) -> str
         low, high = found.difference_ci95
         text = f"{100 * found.difference:+.0f} points ({100 * low:+.0f} to {100 * high:+.0f}), p = {found.p_value:.2g}"
         return text.replace("-", "\N{MINUS SIGN}")
-    return "not on the same scenes" if of_this_run else ""
+    if not of_this_run:
+        return ""
+    here = workspace_of(other) in map(workspace_of, of_this_run)
+    return "not on the same scenes" if here else "in another place"
 
 
 def _rank(run: RunRecord, document: dict[str, Any]) -> tuple[int, str]:
