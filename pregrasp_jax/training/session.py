@@ -116,7 +116,7 @@ def refuse_mirror(config: Config, env: Env) -> None:
         return
     why = (
         f"robot {env.robot.name} starts in one posture between its walls (task.mirrored_start = "
-        f"{config.task.mirrored_start})"
+        f"{env.task.mirrored_start})"
         if env.workspace.symmetric
         else "it is not its own mirror image"
     )
