@@ -18,6 +18,7 @@ from pregrasp_jax.evaluation import Episode, EvaluationResult, Evaluator, evalua
 from pregrasp_jax.policies import scripts
 from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.task.env import make_env
+from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.types import REASONS, EnvState, GraspResult, Observation
 
 ENV = fake_env()
@@ -51,9 +52,9 @@ def _reference(env: Any, policy: scripts.Policy, episodes: int, seed: int, with_
 class _Shaky(FakeEnv):
     """Grasps of odd scenes make no sense afterwards; in scene 2 contacts are dropped, and it holds."""
 
-    def conclude_grasp(self, state: EnvState, physics: Any) -> GraspResult:
+    def conclude_grasp(self, state: EnvState, plan: Plan, physics: Any) -> GraspResult:
         odd = state.scene_index % 2 == 1
-        return GraspResult(~odd, odd, jnp.where(state.scene_index == 2, 7, 0))
+        return GraspResult(~odd, odd, jnp.where(state.scene_index == 2, 7, 0), plan.obstruction)
 
 
 def test_what_happens_during_a_grasp_is_not_silent() -> None:
@@ -214,6 +215,7 @@ def _document(result: EvaluationResult = RESULT, policy: str = "clear") -> dict:
         seed=4,
         hull_bank_hash="h",
         scene_bank_hash="s",
+        workspace_hash="w",
         wall_seconds=12.34,
     )
 
@@ -232,6 +234,7 @@ def test_summary_by_hand() -> None:
         "scene": 3,
         "target": "can",
         "reason": "off_table",
+        "obstruction": "none",
         "success": False,
         "motions": 3,
         "return": 2.0,

@@ -1,6 +1,7 @@
 """Pictures of policies at work: one decision, whole episodes, and the scenes of a bank."""
 
 import collections
+import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator
@@ -16,11 +17,15 @@ from pregrasp_jax import drawing
 from pregrasp_jax.evaluation.player import Player
 from pregrasp_jax.evaluation.runner import MIN_BATCH, Decision, Evaluator
 from pregrasp_jax.heightmap import HullInstances, scene_hulls
+from pregrasp_jax.spaces.workspace import Box, Workspace
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.types import EnvState
 
 SECONDS_PER_FRAME = 1.5
 """s; a panel holds five pictures to look at."""
+
+_CUT_HEIGHT = 0.01
+"""m, what is left of walls that would hide the scene."""
 
 _COLUMNS, _TILE = 4, (240, 320)
 
@@ -116,8 +121,19 @@ def describe_action(env: Env, action: int) -> str:
 
 
 def env_hulls(env: Env, state: EnvState) -> HullInstances:
-    """Return what stands on the table of a scene, robot and walls included."""
-    return scene_hulls(env.bank, env.robot, state.scene, state.physics_obs, env.workspace)
+    """Return what stands on the table of a scene, robot and walls included; see `_cut_away`."""
+    return scene_hulls(env.bank, env.robot, state.scene, state.physics_obs, _cut_away(env.workspace))
+
+
+def _cut_away(workspace: Workspace) -> Workspace:
+    """Return a place whose walls on the viewer's side (y < 0) are low, so that they hide nothing in pictures."""
+
+    def lowered(wall: Box) -> Box:
+        low = min(wall.half_size[2], _CUT_HEIGHT / 2)
+        return dataclasses.replace(wall, center=(*wall.center[:2], low), half_size=(*wall.half_size[:2], low))
+
+    walls = tuple(lowered(wall) if wall.corners()[:, 1].max() < 0 else wall for wall in workspace.walls)
+    return dataclasses.replace(workspace, walls=walls)
 
 
 def _target_name(env: Env, state: EnvState) -> str:
