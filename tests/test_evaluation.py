@@ -260,6 +260,20 @@ def test_document_says_what_was_run(tmp_path: Path) -> None:
     assert "40.0%" in text and "grasp_failed 2, off_table 1" in text and "3.50 +- 1.50" in text
 
 
+def test_what_was_in_the_way_is_counted_by_reason() -> None:
+    blocked = [("unreachable", "wall"), ("unreachable", "end_error"), ("unreachable", "wall"), ("grasp_failed", "wall")]
+    episodes = [
+        dataclasses.replace(_episode(scene, reason, 1), obstruction=obstruction)
+        for scene, (reason, obstruction) in enumerate([*blocked, ("grasp_failed", "none"), ("off_table", "none")])
+    ]
+    document = _document(EvaluationResult((*episodes, _episode(6, "target_in_region", 2))))
+    assert document["obstructions"] == {"unreachable": {"wall": 2, "end_error": 1}, "grasp_failed": {"wall": 1}}
+    assert [row["obstruction"] for row in document["rows"]][:2] == ["wall", "end_error"]
+    text = results.format_evaluation(document)
+    assert "unreachable 3 (wall 2, end_error 1), grasp_failed 2 (wall 1), off_table 1" in text
+    assert "table, native physics" in text, "where it was run"
+
+
 def test_nothing_succeeded() -> None:
     document = _document(EvaluationResult((_episode(0, "unreachable", 0),)))
     assert document["mean_motions"] is None and document["seconds_per_motion"] is None

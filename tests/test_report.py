@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from report_files import ROWS, evaluation_row, run_main, write_evaluation, write_run
+from report_files import ROWS, evaluation_row, log_row, run_main, write_evaluation, write_run
 
 from pregrasp_jax.config import PRESETS, to_dict
 from pregrasp_jax.report import build_page, load_evaluations, read_run
@@ -127,6 +127,17 @@ def test_failures_and_times_are_counted(run_dir: Path) -> None:
     times = time_figures(run)[0]
     assert "75 %, 67.5 s" in times and "25 %, 22.5 s" in times and "90 s in all" in times
     assert [duration(s) for s in (0, 100, 600, 36000)] == ["0 s", "100 s", "10 min", "10 h"]
+
+
+def test_what_was_in_the_way_stands_beside_its_reason(tmp_path: Path) -> None:
+    more = {"reasons/unreachable": 4, "unreachable/wall": 3, "unreachable/end_error": 1, "unreachable/no_ik": 0}
+    run_dir = write_run(tmp_path / "first", [log_row(100, 10.0, **more), log_row(200, 20.0, **more)])
+    stopped = {"failures": {"unreachable": 1}, "obstructions": {"unreachable": {"wall": 1}}, "workspace": "shelf"}
+    file = write_evaluation(run_dir / "a.json", "first", [1, 1, 1, 0], **stopped)
+    run = read_run(run_dir)
+    _, test, training = failure_figures(run, load_evaluations(run, [file]))
+    assert "seen objects, shelf, orthographic camera, 4 scenes" in test and "25 % (1: wall 1)" in test
+    assert "29 % (8: wall 6, end not reached 2)" in training and "(6)" in training
 
 
 # --- damaged and young runs ------------------------------------------------------------------------------------------

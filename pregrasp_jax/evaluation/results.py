@@ -195,9 +195,9 @@ def _damaged_keys(document: dict[str, Any]) -> list[str]:
     good["success_ci95"] = is_interval(interval)
     good["mean_motions"] = motions == [None, None] or all(map(is_number, motions))
     good["failures"] = isinstance(document.get("failures"), dict)
-    good["workspace"], good["workspace_hash"] = (
-        isinstance(document.get(key, ""), str) for key in ("workspace", "workspace_hash")
-    )
+    good |= {key: isinstance(document.get(key, ""), str) for key in ("workspace", "workspace_hash")}
+    found = document.get("obstructions", {})
+    good["obstructions"] = isinstance(found, dict) and all(isinstance(counts, dict) for counts in found.values())
     good["rows"] = isinstance(rows, list) and len(rows) > 0 and all(map(_is_row, rows))
     good["config"] = isinstance(config, dict) and isinstance(config.get("task", {}), dict)
     return [key for key, is_good in good.items() if not is_good]

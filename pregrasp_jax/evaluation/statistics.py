@@ -220,11 +220,13 @@ def _compare_pairs(a: Mapping[str, Any], b: Mapping[str, Any], pairs: list[tuple
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
     """Yield one line for every setting in which two paired evaluations differ."""
+    if places := _places(a, b):
+        yield f"workspace: {places[0]} | {places[1]}"
     for key in ("camera", "physics", "seed"):
         if a[key] != b[key]:
             yield f"{key}: {a[key]} | {b[key]}"
     tasks = [flatten(document.get("config", {}).get("task", {})) for document in (a, b)]
-    for key in sorted(set(tasks[0]) & set(tasks[1]) - {"camera"}):
+    for key in sorted(set(tasks[0]) & set(tasks[1]) - {"camera", "workspace"}):
         if tasks[0][key] != tasks[1][key]:
             yield f"task.{key}: {tasks[0][key]} | {tasks[1][key]}"
 

@@ -114,7 +114,8 @@ def _place(run: RunRecord) -> Iterator[str]:
     workspace = run.setting("task", "workspace", TaskConfig().workspace)
     if workspace != TaskConfig().workspace:
         yield from ("--workspace", workspace)
-    for name, value in run.setting("task", "place", {}).items():
+    place = run.setting("task", "place", {})
+    for name, value in place.items() if isinstance(place, dict) else ():
         if value is not None:
             yield from (f"--task.place.{name.replace('_', '-')}", str(value))
 
