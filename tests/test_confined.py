@@ -14,6 +14,7 @@ import pytest
 from pregrasp_jax.config import Config, NetworkConfig, PlaceConfig, TaskConfig, TaskOverrides
 from pregrasp_jax.evaluation.player import _task
 from pregrasp_jax.robot import clearance, get_robot
+from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.robot.ur5e_rg2 import moving
 from pregrasp_jax.scene.spec import compile_spec, scene_spec
 from pregrasp_jax.spaces import grid
@@ -135,7 +136,7 @@ def test_the_other_posture_is_the_mirror_image_of_the_arm():
         nearest = min(max(gap.min(axis=0).max(), gap.min(axis=1).max()) for gap in gaps)
         assert nearest < 1e-4, "every geom has its image; left and right fingers are each other's"
     poses = [np.asarray(ROBOT.hand_pose(jnp.asarray(home))) for home in ROBOT.homes]
-    np.testing.assert_allclose(*poses, atol=1e-5)
+    np.testing.assert_allclose(poses[0], poses[1], atol=1e-5)
     assert np.abs(ROBOT.homes[0] - ROBOT.homes[1]).max() > 1
 
 
@@ -278,11 +279,12 @@ def test_a_place_in_which_no_push_can_be_executed_is_refused():
         refuse_blocked(ROBOT, blocked, make_push(ROBOT, blocked, TaskConfig(), max_distance=0.2))
 
 
-def env_in(workspace: Workspace, **changes: Any) -> Env:
-    task = TaskConfig(**{key: value for key, value in changes.items() if key != "robot"})
+def env_in(workspace: Workspace, robot: Robot = ROBOT, **task: Any) -> Env:
+    """An environment of which only robot and place are asked."""
     nothing: Any = None
-    robot = changes.get("robot", ROBOT)
-    return Env(task, workspace, robot, *[nothing] * 6, 0.2)
+    names = ("primitive", "rules", "bank", "eligible", "scenes", "engine")
+    rest = dict.fromkeys(names, nothing)
+    return Env(task=TaskConfig(**task), workspace=workspace, robot=robot, max_distance=0.2, **rest)
 
 
 def test_mirror_images_that_are_no_scenes_are_not_learned_from():
