@@ -283,7 +283,7 @@ def env_in(workspace: Workspace, robot: Robot = ROBOT, **task: Any) -> Env:
     """An environment of which only robot and place are asked."""
     nothing: Any = None
     names = ("primitive", "rules", "bank", "eligible", "scenes", "engine")
-    rest = dict.fromkeys(names, nothing)
+    rest: dict[str, Any] = dict.fromkeys(names, nothing)
     return Env(task=TaskConfig(**task), workspace=workspace, robot=robot, max_distance=0.2, **rest)
 
 
