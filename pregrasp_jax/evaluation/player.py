@@ -85,6 +85,8 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     env = make_env(config, split="test", progress=packed)
     if trained is None:
         return Player(_make_script(request.policy, env, config), None, env, config)
+    if config.network.mirror and not env.symmetric:
+        say(f"note: the policy averages mirror images, which are no scenes of workspace '{env.workspace.name}'")
     # Of the task that it was trained on: a window of another size is another input.
     q_function = make_q_function(config.network, trained.config.task, env.primitive.actions)
     if not q_function.fits(trained.params):

@@ -209,7 +209,10 @@ def make_env(
     bank = load_bank_for(config.assets.object_dir, config.assets.object_set)
     eligible = eligible_targets(get_robot(config.task.robot), bank, origin=str(config.assets.object_dir or "built in"))
     scenes = scene_bank.load_or_build(bank, eligible, config.scene, split, threads=threads, progress=progress)
-    return assemble(config, bank, scenes, eligible=eligible, threads=threads)
+    refuse_scenes(place_of(config.task), scenes)
+    env = assemble(config, bank, scenes, eligible=eligible, threads=threads)
+    refuse_blocked(env.robot, env.workspace, env.primitive)
+    return env
 
 
 def assemble(
@@ -228,9 +231,7 @@ def assemble(
     refuse_walls(robot, workspace)
     eligible = eligible_targets(robot, bank) if eligible is None else eligible
     reach = longest_push(config)
-    refuse_scenes(workspace, scenes)
     parts = make_task(config.task, robot, workspace, bank, max_distance=reach)
-    refuse_blocked(robot, workspace, parts[0])
     engine = make_engine(config.physics.engine, bank, robot, workspace, threads=threads)
     return Env(config.task, workspace, robot, *parts, bank, eligible, scenes, engine, reach)
 
