@@ -55,7 +55,6 @@ class Robot:
         home: [J] joint positions at the start, host array, rad or m.
         links: the bodies that move, and their hulls.
         attach: host; (spec) -> None adds bodies, actuators and constraints to a scene.
-        mirrored_home: [J] the mirror image of that posture in the plane y = 0, host array; None if the robot has none.
         set_home: host; (mj_model, mj_data, *, home=`home`) -> None puts the robot at rest at joint positions.
         hand_pose: (joint_pos [J]) -> [7] pose of the grasp point in the world, x forward, z up.
         follow: (joint_pos [J], poses [T, 7], apertures [T], workspace) -> controls [T, A] and code [T] int32, for every
@@ -64,6 +63,7 @@ class Robot:
         closing_region: (aperture () rad) -> `ClosingRegion`; None for a hand without one.
         eligibility: host; (hull bank) -> `Eligibility`.
         grasp_aperture: rad, commanded to close with constant force.
+        mirrored_home: [J] the mirror image of `home` in the plane y = 0, host array; None if the robot has none.
     """
 
     name: str
@@ -71,7 +71,6 @@ class Robot:
     actuators: tuple[str, ...]
     start: HandPose
     home: np.ndarray
-    mirrored_home: np.ndarray | None
     links: Links
     attach: Callable[[mujoco.MjSpec], None]
     set_home: Callable[..., None]
@@ -81,6 +80,7 @@ class Robot:
     closing_region: Callable[[jax.Array], ClosingRegion] | None
     eligibility: Callable[[HullBank], Eligibility]
     grasp_aperture: float
+    mirrored_home: np.ndarray | None = None
 
     @property
     def homes(self) -> np.ndarray:
