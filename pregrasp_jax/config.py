@@ -242,6 +242,27 @@ class TaskOverrides:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlanningConfig:
+    """A search in a scene that is rebuilt from the camera's pictures (docs/planning.md)."""
+
+    budget_ms: float = 0.0
+    candidates: int = 10
+    scripted: bool = True
+    variants: int = 3
+    depth: int = 2
+    rounds: tuple[int, ...] = (8, 4)
+    discount: float = 0.97
+    salvage: float = 0.6
+    grasp: bool = True
+    position_jitter: float = 0.002
+    turn_jitter: float = 0.03
+    size_jitter: float = 0.0007
+    mass_jitter: float = 1.6
+    shrink: float = 0.0005
+    pinhole_edge: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class EvaluationConfig:
     """One evaluation."""
 

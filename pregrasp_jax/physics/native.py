@@ -217,7 +217,12 @@ def make_engine(
         model: a slot model of other hulls or options for the same objects.
     """
     model = model or slot_model.make_slot_model(native_spec(robot, workspace), bank)
-    native = _Native(Simulations(model, robot, threads=threads), robot)
+    return engine_of(Simulations(model, robot, threads=threads), robot)
+
+
+def engine_of(simulations: Simulations, robot: Robot) -> Engine:
+    """Return the engine that runs on `simulations`; see `make_engine`."""
+    native = _Native(simulations, robot)
     return Engine(
         name="native",
         init=native.init,
