@@ -209,10 +209,7 @@ class Config:
         Raises:
             ValueError: a value is outside its range; one line names the key, the value and the range.
         """
-        for key, (low, high) in _RANGES.items():
-            value = operator.attrgetter(key)(self)
-            if value is not None and not low <= value <= high:
-                raise ValueError(f"{key} = {value} is out of range; allowed is {low} to {high}")
+        _check_ranges(self, _RANGES)
         if self.task.r_in >= self.task.r_out:
             raise ValueError(f"task.r_in = {self.task.r_in} must be below task.r_out = {self.task.r_out}")
         if self.scene.min_objects > self.scene.max_objects:
@@ -243,23 +240,25 @@ class TaskOverrides:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanningConfig:
-    """A search in a scene that is rebuilt from the camera's pictures (docs/planning.md)."""
+    """A search in a scene that is rebuilt from the camera's pictures, see docs/planning.md."""
 
     budget_ms: float = 0.0
+    """ms for a decision: no round of simulations begins that would exceed it. 0 sets no limit, and results repeat."""
     candidates: int = 10
-    scripted: bool = True
+    """Pushes that the network proposes, 2 cm apart; scripts fill a batch of 16."""
     variants: int = 3
+    """Rebuilt scenes in which a push is tried; all but the first have disturbed poses, sizes and masses."""
     depth: int = 2
-    rounds: tuple[int, ...] = (8, 4)
-    discount: float = 0.97
-    salvage: float = 0.6
-    grasp: bool = True
-    position_jitter: float = 0.002
-    turn_jitter: float = 0.03
-    size_jitter: float = 0.0007
-    mass_jitter: float = 1.6
-    shrink: float = 0.0005
-    pinhole_edge: float = 0.0
+    """Pushes of the network that may follow a candidate."""
+
+    def validate(self) -> "PlanningConfig":
+        """Return self.
+
+        Raises:
+            ValueError: a value is outside its range; one line names the key, the value and the range.
+        """
+        _check_ranges(self, _PLANNING_RANGES, "planning.")
+        return self
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -272,12 +271,27 @@ class EvaluationConfig:
     scene: SceneConfig = field(default_factory=SceneConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     task: TaskOverrides = field(default_factory=TaskOverrides)
+    plan: bool = False
+    """Let a trained policy search in a rebuilt scene before every push."""
+    planning: PlanningConfig = field(default_factory=PlanningConfig)
     episodes: int = 100
     """Test scenes to run, from the first; all policies meet the same."""
     seed: int = 0
     """Seed of the policy's own randomness; scenes, yaws and targets are fixed."""
     num_envs: int = 0
     """Scenes side by side, 0 chooses; with `native` results do not depend on it."""
+
+
+def _check_ranges(config: Any, ranges: Mapping[str, tuple[float, float]], prefix: str = "") -> None:
+    """Refuse a value of a config that is outside its range; ``None`` is in any.
+
+    Raises:
+        ValueError: one line names the key after `prefix`, the value and the range.
+    """
+    for key, (low, high) in ranges.items():
+        value = operator.attrgetter(key)(config)
+        if value is not None and not low <= value <= high:
+            raise ValueError(f"{prefix}{key} = {value} is out of range; allowed is {low} to {high}")
 
 
 _RANGES: dict[str, tuple[float, float]] = {
@@ -324,6 +338,13 @@ _RANGES: dict[str, tuple[float, float]] = {
     "train.evaluate_every": (0, 1_000_000_000),
     "train.log_every": (1, 1_000_000_000),
     "train.fused_iterations": (0, 1_000_000),
+}
+
+_PLANNING_RANGES: dict[str, tuple[float, float]] = {
+    "budget_ms": (0.0, 600_000.0),
+    "candidates": (1, 64),
+    "variants": (1, 8),
+    "depth": (0, 8),
 }
 
 _CPU = Config(

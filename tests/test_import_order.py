@@ -22,6 +22,7 @@ ORDER = [
     ["learning"],
     ["policies"],
     ["checkpoint"],
+    ["planning"],
     ["evaluation", "gymnasium"],
     ["training"],
     ["report"],

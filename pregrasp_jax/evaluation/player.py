@@ -11,10 +11,11 @@ from typing import Any
 import jax
 
 from pregrasp_jax.checkpoint import load_policy
-from pregrasp_jax.config import Config, EvaluationConfig, TaskOverrides, with_absolute_paths
+from pregrasp_jax.config import Config, EvaluationConfig, PlanningConfig, TaskOverrides, with_absolute_paths
 from pregrasp_jax.evaluation import EpisodeCallback, Evaluator, evaluation_document
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.machine import announced_compilation
+from pregrasp_jax.planning.planner import Planner
 from pregrasp_jax.policies import scripts
 from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.policies.scripts import Policy
@@ -42,7 +43,7 @@ class Player:
         config: what the environment was made from.
     """
 
-    policy: Policy
+    policy: Policy | Planner
     q_values: Callable[[Any], jax.Array] | None
     env: Env
     config: Config
@@ -63,6 +64,7 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     """
     prepare()
     trained = _load(request.policy)
+    _check_planning(request)
     config = _environment_config(request, Config() if trained is None else trained.config)
     if trained is not None:
         _refuse_other_hand(config, trained.config)
@@ -83,7 +85,11 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     if not q_function.fits(trained.params):
         raise ValueError(f"policy {trained.origin} does not fit its network in this version of the package")
     q_values = jax.jit(lambda params, state: q_function.values(params, state.obs, state.scene.target))
-    policy = make_learned(env, q_function.values)(trained.params)
+    policy = (
+        Planner(env, q_function, trained.params, request.planning, threads=request.physics.threads)
+        if request.plan
+        else make_learned(env, q_function.values)(trained.params)
+    )
     return Player(policy, functools.partial(q_values, trained.params), env, config)
 
 
@@ -119,7 +125,17 @@ def run_evaluation(
         hull_bank_hash=player.env.bank.content_hash,
         scene_bank_hash=player.env.scenes.content_hash,
         wall_seconds=time.monotonic() - start,
+        planning=player.policy.describe() if isinstance(player.policy, Planner) else None,
     )
+
+
+def _check_planning(request: EvaluationConfig) -> None:
+    """Refuse a search that has no network to ask, and settings of one that is not wanted."""
+    if request.plan and request.policy in scripts.SCRIPTS:
+        raise ValueError(f"plan = True: policy {request.policy} is a script; allowed is pretrained, or a run folder")
+    if not request.plan and request.planning != PlanningConfig():
+        raise ValueError("planning.* is set, but plan = False; allowed is plan = True with it")
+    request.planning.validate()
 
 
 def _load(spec: str) -> Any:

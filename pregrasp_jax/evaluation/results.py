@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 
 from pregrasp_jax import io
 from pregrasp_jax.config import Config, to_dict
-from pregrasp_jax.evaluation.statistics import is_interval, is_number, wilson_interval
+from pregrasp_jax.evaluation.statistics import is_interval, is_number, policy_name, wilson_interval
 from pregrasp_jax.machine import versions
 
 FORMAT = "pregrasp_jax evaluation 1"
@@ -114,6 +115,7 @@ def evaluation_document(
     hull_bank_hash: str,
     scene_bank_hash: str,
     wall_seconds: float,
+    planning: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the content of an evaluation file (`pregrasp-jax evaluate --json`).
 
@@ -125,10 +127,12 @@ def evaluation_document(
         hull_bank_hash: which objects.
         scene_bank_hash: which scenes; two files can be paired only if both hashes agree.
         wall_seconds: s, how long the evaluation took on this machine, compilation included.
+        planning: settings of the search that decided and what it took, None without one.
     """
     return {
         "format": FORMAT,
         "policy": policy,
+        "planning": None if planning is None else dict(planning),
         "physics": config.physics.engine,
         "object_set": config.assets.object_set,
         "camera": config.task.camera,
@@ -179,6 +183,7 @@ def _damaged_keys(document: dict[str, Any]) -> list[str]:
     good["mean_motions"] = motions == [None, None] or all(map(is_number, motions))
     good["failures"] = isinstance(document.get("failures"), dict)
     good["rows"] = isinstance(rows, list) and len(rows) > 0 and all(map(_is_row, rows))
+    good["planning"] = document.get("planning") is None or isinstance(document["planning"], dict)
     good["config"] = isinstance(config, dict) and isinstance(config.get("task", {}), dict)
     return [key for key, is_good in good.items() if not is_good]
 
@@ -192,7 +197,7 @@ def _is_row(row: Any) -> bool:
 def format_evaluation(document: dict[str, Any]) -> str:
     """Return the table that `pregrasp-jax evaluate` prints."""
     low, high = document["success_ci95"]
-    title = f"{document['policy']} on {document['episodes']} {document['object_set']} scenes"
+    title = f"{policy_name(document)} on {document['episodes']} {document['object_set']} scenes"
     lines = {
         "success": f"{document['success_rate']:.1%}   95 % interval {low:.1%} to {high:.1%}",
         "target in region": f"{document['in_region_rate']:.1%}",
@@ -201,6 +206,8 @@ def format_evaluation(document: dict[str, Any]) -> str:
         "mean return": f"{document['mean_return']:.2f}",
         "failures": ", ".join(f"{reason} {count}" for reason, count in document["failures"].items()) or "none",
     }
+    if planning := document.get("planning"):
+        lines["decision"] = "{seconds:.2f} s, {pushes:.0f} simulated pushes".format(**planning["per_decision"])
     if document.get("overflows"):
         lines["contacts dropped"] = f"in {document['overflows']} episodes: the limits of the physics engine are too low"
     settings = f"{document['physics']} physics, {document['camera']} camera, seed {document['seed']}"
@@ -230,7 +237,7 @@ def _row(document: dict[str, Any]) -> tuple[str, ...]:
     low, high = document["success_ci95"]
     mean, std = document["mean_motions"], document["std_motions"]
     return (
-        document["policy"],
+        policy_name(document),
         f"{document['episodes']} {document['object_set']}",
         f"{document['success_rate']:.1%}",
         f"{low:.0%} to {high:.0%}",

@@ -14,7 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
+from pregrasp_jax.evaluation.deliberation import Deliberation
 from pregrasp_jax.evaluation.results import GRASP_FAILED, Episode, EvaluationResult
+from pregrasp_jax.planning.planner import Planner
 from pregrasp_jax.policies.scripts import Policy
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.primitive import Plan
@@ -83,12 +85,13 @@ class Evaluator:
         self._num_envs = max(num_envs, MIN_BATCH)
         self._start = jax.jit(jax.vmap(self._start_one))
         self._restart = jax.jit(jax.vmap(self._restart_one))
-        decide = jax.vmap(self._decide_one, in_axes=(None, 0, None))
-        self._push = make_stages(env.engine, decide, jax.vmap(self._conclude_one))
+        decide, conclude = jax.vmap(self._decide_one, in_axes=(None, 0, None)), jax.vmap(self._conclude_one)
+        self._push = make_stages(env.engine, decide, conclude)
+        self._act = make_stages(env.engine, jax.vmap(self._plan_one), conclude)
         self._grasp = make_stages(env.engine, jax.vmap(self._plan_grasp_one), jax.vmap(self._conclude_grasp_one))
         self._compiled: dict[Hashable, Callable[..., Any]] = {}
 
-    def compile(self, policy: Policy, *, episodes: int) -> None:
+    def compile(self, policy: Policy | Planner, *, episodes: int) -> None:
         """Compile now what `run` compiles on its way otherwise; it may take minutes.
 
         Args:
@@ -99,13 +102,17 @@ class Evaluator:
         runs = jax.eval_shape(self._start, indices)
         enclosed = jax.eval_shape(self._start, np.zeros(self._num_envs, np.int32))
         self._program(self._start, indices)
-        self._program(self._push, _bound(policy), runs, jax.random.key(0))
+        if isinstance(policy, Planner):
+            policy.compile()
+            self._program(self._act, runs, indices)
+        else:
+            self._program(self._push, _bound(policy), runs, jax.random.key(0))
         self._program(self._restart, runs, indices)
         self._program(self._grasp, enclosed.state)
 
     def run(
         self,
-        policy: Policy,
+        policy: Policy | Planner,
         *,
         episodes: int,
         seed: int = 0,
@@ -146,7 +153,7 @@ class Evaluator:
         finish(self._grasp_all(enclosed))
         return EvaluationResult(tuple(sorted(finished, key=lambda episode: episode.scene)))
 
-    def play(self, policy: Policy, scene: int, *, seed: int = 0, with_grasp: bool = True) -> Iterator[Decision]:
+    def play(self, policy: Policy | Planner, scene: int, *, seed: int = 0, with_grasp: bool = True) -> Iterator[Decision]:
         """Yield the decisions of one scene, the last of which is the end of the episode: exactly what `run` counts.
 
         Args:
@@ -155,11 +162,11 @@ class Evaluator:
             seed: as in `run`.
             with_grasp: as in `run`.
         """
-        policy, key = _bound(policy), jax.random.key(seed)
+        push = self._pusher(policy, jax.random.key(seed))
         runs = self._call(self._start, np.full(MIN_BATCH, scene, np.int32))
         run = _first(runs)
         while run.reason == RUNNING:
-            runs, before = self._call(self._push, policy, runs, key), run
+            runs, before = push(runs), run
             run = _first(runs)
             yield Decision(before.state, int(run.action))
         (episode,) = self._grasp_all([run]) if self._asks_for_grasp(run, with_grasp) else [self._episode(run)]
@@ -168,14 +175,14 @@ class Evaluator:
     def _asks_for_grasp(self, run: _Run, with_grasp: bool) -> bool:
         return with_grasp and int(run.reason) in self._env.rules.successes
 
-    def _run_to_ends(self, policy: Policy, episodes: int, key: jax.Array) -> Iterator[_Run]:
+    def _run_to_ends(self, policy: Policy | Planner, episodes: int, key: jax.Array) -> Iterator[_Run]:
         """Yield every scene when its pushes have ended, as host arrays."""
-        policy, num_envs = _bound(policy), self._batch_size(episodes)
+        push, num_envs = self._pusher(policy, key), self._batch_size(episodes)
         waiting = iter(range(num_envs, episodes))
         busy = np.arange(num_envs) < episodes
         runs = self._call(self._start, np.where(busy, np.arange(num_envs), 0).astype(np.int32))
         while busy.any():
-            runs = self._call(self._push, policy, runs, key)
+            runs = push(runs)
             ended = np.flatnonzero(busy & (np.asarray(runs.reason) != RUNNING))
             if ended.size == 0:
                 continue
@@ -185,6 +192,14 @@ class Evaluator:
             following[ended] = [next(waiting, -1) for _ in ended]
             busy[ended] = following[ended] >= 0
             runs = self._call(self._restart, runs, following)
+
+    def _pusher(self, policy: Policy | Planner, key: jax.Array) -> Callable[[_Run], _Run]:
+        """Return the function that lets a policy decide once more in every scene of a batch, and pushes."""
+        if isinstance(policy, Planner):
+            deliberation = Deliberation(policy, key)
+            return lambda runs: self._call(self._act, runs, deliberation(runs.state, np.asarray(runs.reason) == RUNNING))
+        bound = _bound(policy)
+        return lambda runs: self._call(self._push, bound, runs, key)
 
     def _batch_size(self, episodes: int) -> int:
         """Return how many scenes are pushed side by side."""
@@ -238,12 +253,15 @@ class Evaluator:
         return _where(index >= 0, self._start_one(jnp.maximum(index, 0)), run)
 
     def _decide_one(self, policy: Policy, run: _Run, key: jax.Array) -> tuple[Any, Plan, Any]:
-        """Let the policy decide, and plan; an ended run stays where it is."""
+        """Let the policy decide, and plan."""
         state = run.state
         key = jax.random.fold_in(jax.random.fold_in(key, state.scene_index), state.num_pushes)
-        action = policy(state, key)
-        plan = self._env.plan(state, action).unless(run.reason != RUNNING, "no_ik")
-        return state.physics, plan, run.replace(action=action)
+        return self._plan_one(run, policy(state, key))
+
+    def _plan_one(self, run: _Run, action: jax.Array) -> tuple[Any, Plan, Any]:
+        """Plan a push that is decided; an ended run stays where it is."""
+        plan = self._env.plan(run.state, action).unless(run.reason != RUNNING, "no_ik")
+        return run.state.physics, plan, run.replace(action=action)
 
     def _conclude_one(self, run: _Run, plan: Plan, physics: Any) -> _Run:
         """Return the run after a push; an ended run stays as it is."""

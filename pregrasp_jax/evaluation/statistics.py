@@ -17,6 +17,11 @@ _SAME = ("object_set", "scene_bank_hash", "hull_bank_hash")
 """What two evaluations must share before their episodes can be paired."""
 
 
+def policy_name(document: Mapping[str, Any]) -> str:
+    """Return what decided in an evaluation: a policy, or a search that asks it."""
+    return document["policy"] + (" with planning" if document.get("planning") else "")
+
+
 def is_number(value: Any) -> TypeGuard[float]:
     """Return whether a JSON value is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
@@ -174,7 +179,7 @@ def _compare_pairs(a: Mapping[str, Any], b: Mapping[str, Any], pairs: list[tuple
     )
     trials = len(pairs)
     return Comparison(
-        policies=(a["policy"], b["policy"]),
+        policies=(policy_name(a), policy_name(b)),
         episodes=trials,
         success_rates=((both + only_a) / trials, (both + only_b) / trials),
         success_ci95=(wilson_interval(both + only_a, trials), wilson_interval(both + only_b, trials)),
@@ -194,6 +199,10 @@ def _differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
     for key in ("camera", "physics", "seed"):
         if a[key] != b[key]:
             yield f"{key}: {a[key]} | {b[key]}"
+    searches = [(document.get("planning") or {}).get("settings", {}) for document in (a, b)]
+    for key in sorted(set(searches[0]) | set(searches[1])):
+        if searches[0].get(key) != searches[1].get(key):
+            yield f"planning.{key}: {searches[0].get(key, 'off')} | {searches[1].get(key, 'off')}"
     tasks = [document.get("config", {}).get("task", {}) for document in (a, b)]
     for key in sorted(set(tasks[0]) & set(tasks[1]) - {"camera"}):
         if tasks[0][key] != tasks[1][key]:

@@ -111,7 +111,7 @@ class Simulations:
             self.load(object_ids)
             batch, num_scenes = self._batch, len(state)
             # The state does not say which objects sleep, so all are woken: the result depends on nothing before.
-            batch.reset(np.arange(num_scenes))
+            batch.reset(np.arange(num_scenes), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
             batch.state[:num_scenes] = state
             batch.warning[:num_scenes] = 0
             fine = _interpolate(ctrl, self.num_substeps)

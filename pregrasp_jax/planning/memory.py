@@ -5,15 +5,18 @@ from typing import NamedTuple
 import numpy as np
 
 from pregrasp_jax.planning import outlines
-from pregrasp_jax.planning.solids import Frustums, mass_properties
+from pregrasp_jax.planning.solids import Frustums, directions, mass_properties
 from pregrasp_jax.spaces import grid
-from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, ROBOT_ID, TABLE_ID, Observation
+from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, Observation
 
 _HIDDEN = 0.93
 """An object beside something that hides it, of which less than this share is seen of what was seen before, is hidden."""
 
 _MIN_MATCH = 0.6
 """Share of the cells that must agree, else the remembered shape is not what is seen now: it fell, perhaps."""
+
+PINHOLE_EDGE = 0.0
+"""m by which a pinhole camera's heightmap shows objects too large on all sides."""
 
 _COARSE = np.deg2rad(np.arange(-180, 180, 15))
 _SHIFTS = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2)
@@ -58,25 +61,23 @@ NOTHING: Memory = (None,) * MAX_OBJECTS
 """The memory of an episode that begins."""
 
 
-def look(sight: Sight, memory: Memory, *, unseen: np.ndarray, edge: float = 0.0) -> Memory:
+def look(sight: Sight, memory: Memory, *, hidden: np.ndarray, camera: np.ndarray | None) -> Memory:
     """Return what is known of every object after another picture.
 
     Args:
         sight: the picture.
         memory: before it.
-        unseen: [H, W] bool, cells of which the camera sees nothing, beside those of the robot.
-        edge: m by which the camera sees objects too large on all sides.
+        hidden: [H, W] bool, cells of which nothing is seen.
+        camera: [3] m, where the camera is; None for one that looks straight down everywhere.
     """
     ids = np.asarray(sight.obs.instance_ids)
     height = grid.dequantize_height(np.asarray(sight.obs.height))
-    hidden = (ids == ROBOT_ID) | unseen
-    return tuple(
-        _look_at(ids == slot + 1, height, hidden, ids == TABLE_ID, shape, edge) for slot, shape in enumerate(memory)
-    )
+    edge = 0.0 if camera is None else PINHOLE_EDGE
+    return tuple(_look_at(ids == slot + 1, height, hidden, shape, edge) for slot, shape in enumerate(memory))
 
 
 def _look_at(
-    mask: np.ndarray, height: np.ndarray, hidden: np.ndarray, table: np.ndarray, shape: Shape | None, edge: float
+    mask: np.ndarray, height: np.ndarray, hidden: np.ndarray, shape: Shape | None, edge: float
 ) -> Shape | None:
     """Return what is known of one object, whose cells are `mask` [H, W] bool."""
     seen = np.flatnonzero(mask)
@@ -103,8 +104,6 @@ def _new_shape(xy: np.ndarray, height: np.ndarray, seen: np.ndarray, edge: float
 
 def moved(solids: Frustums, offset: np.ndarray) -> Frustums:
     """Return frustums [MAX_HULLS] moved by `offset` [2] m."""
-    from pregrasp_jax.planning.solids import directions
-
     shift = directions(solids.angle) @ offset
     return solids._replace(support=solids.support + shift[:, None, :])
 

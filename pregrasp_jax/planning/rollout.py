@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax.learning.q_function import QFunction
-from pregrasp_jax.physics.base import Engine
+from pregrasp_jax.physics.native import engine_of
+from pregrasp_jax.planning.simulation import Simulations
 from pregrasp_jax.policies import scripts
 from pregrasp_jax.task import registry
 from pregrasp_jax.task.env import Env
@@ -43,26 +44,24 @@ class Pushed(NamedTuple):
 class Rollout:
     """Compiled programs of one environment and one network; shapes never change."""
 
-    def __init__(self, env: Env, engine: Engine, q_function: QFunction, params: Any, *, batch: int):
+    def __init__(self, env: Env, simulations: Simulations, q_function: QFunction, params: Any, *, batch: int):
         """Compile nothing yet.
 
         Args:
             env: of the task; objects, scenes and engine of it are not used.
-            engine: of rebuilt objects.
+            simulations: of rebuilt objects.
             q_function: of the policy.
             params: of the policy.
             batch: pushes at a time.
         """
         self.batch = batch
-        self._env, self._engine, self._params = env, engine, params
-        self._q = q_function
-        self._start = jax.jit(jax.vmap(self._start_one, (None, 0, 0, 0, None, None, None)))
-        self._propose = jax.jit(self._propose_one)
-        self._value = jax.jit(self._value_map)
-        self._take = jax.jit(lambda tree, index: jax.tree.map(lambda leaf: leaf[index], tree))
-        self._join = jax.jit(lambda a, b: jax.tree.map(lambda *leaves: jnp.concatenate(leaves), a, b))
-        self._push = make_stages(engine, self._before_push, self._after_push)
-        self._grasp = make_stages(engine, self._before_grasp, self._after_grasp)
+        self._env, self._params, self._q = env, params, q_function
+        self._engine = engine_of(simulations, env.robot)
+        self._num_velocities = simulations.model.mj_model.nv
+        self._start = jax.jit(jax.vmap(self._start_one, (None, 0, 0, 0, None, None)))
+        self._propose, self._values = jax.jit(self._propose_one), jax.jit(self._values_one)
+        self._push = make_stages(self._engine, self._before_push, self._after_push)
+        self._grasp = make_stages(self._engine, self._before_grasp, self._after_grasp)
         self._compiled: dict[str, Callable[..., Any]] = {}
 
     def start(
@@ -73,34 +72,39 @@ class Rollout:
         qpos: np.ndarray,
         hand: HandPose,
         target: int,
-        joint_pos: np.ndarray,
     ) -> EnvState:
-        """Return the states [V] of rebuilt scenes: objects stand at poses [V, MAX_OBJECTS, 7], the robot where it is."""
-        del joint_pos
-        return self._start(bank, object_ids, poses, qpos, hand, np.int32(target), 0)
+        """Return the states [V] of rebuilt scenes, on the host.
 
-    def value_map(self, obs: Observation, target: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return what the network says of every push of a real picture [H, W, K], and which are allowed."""
-        return jax.device_get(self._value(self._params, obs, np.int32(target)))
+        Args:
+            bank: the objects.
+            object_ids: [V, MAX_OBJECTS] index into it, -1 for none.
+            poses: [V, MAX_OBJECTS, 7] of the objects.
+            qpos: [V, nq] of the objects and the robot.
+            hand: where it has been sent.
+            target: slot.
+        """
+        return jax.device_get(self._start(bank, object_ids, poses, qpos, hand, np.int32(target)))
 
-    def propose(self, state: EnvState, key: jax.Array) -> np.ndarray:
-        """Return pushes [NUM_SCRIPTED] int32 of scripts in a rebuilt scene."""
-        return np.asarray(self._propose(state, key))
+    def values(self, obs: Observation, target: int) -> np.ndarray:
+        """Return what the network says of every push after a real picture, [H, W, K]; -inf where it is not allowed."""
+        return np.asarray(self._values(self._params, obs, np.int32(target)))
 
-    def succeeded(self, reason: np.ndarray) -> np.ndarray:
-        """Return which reasons [...] count as success, [...] bool."""
-        return np.isin(reason, self._env.rules.successes)
+    def propose(self, roots: EnvState, key: jax.Array) -> list[int]:
+        """Return the pushes of scripts in the first of rebuilt scenes [V]; `NUM_SCRIPTED` of them."""
+        return np.asarray(self._propose(jax.tree.map(lambda leaf: leaf[0], roots), key)).tolist()
 
-    def take(self, states: EnvState, index: np.ndarray) -> EnvState:
-        """Return the states at `index` [B]."""
-        return self._take(states, index)
+    def succeeded(self, reason: jax.Array) -> np.ndarray:
+        """Return which reasons [B] count as success, [B] bool."""
+        return np.isin(np.asarray(reason), self._env.rules.successes)
 
     def push(self, bank: HullBank, states: EnvState, actions: np.ndarray, execute: np.ndarray) -> Pushed:
         """Push in B states; where not to be executed [B], nothing is simulated."""
         return self._run("push", self._push, bank, self._params, states, actions, execute)
 
     def grasp(self, bank: HullBank, states: EnvState, execute: np.ndarray) -> np.ndarray:
-        """Return which grasps hold, [B] bool."""
+        """Return which grasps hold, [B] bool; those not to be executed [B] do not."""
+        if not execute.any():
+            return execute
         return np.asarray(self._run("grasp", self._grasp, bank, states, execute).held)
 
     def _run(self, name: str, stages: Stages, *args: Any) -> Any:
@@ -123,22 +127,19 @@ class Rollout:
         qpos: jax.Array,
         hand: HandPose,
         target: jax.Array,
-        pushes: int,
     ) -> EnvState:
-        physics = self._engine.place(object_ids, qpos, jnp.zeros(self.num_velocities))
-        blank = jnp.zeros((1,))
+        physics = self._engine.place(object_ids, qpos, jnp.zeros(self._num_velocities))
+        blank = jnp.zeros(1)  # drawn and measured by `look`
         state = EnvState(
             physics=physics,
             scene=SceneParams(object_ids, poses, target),
             scene_index=jnp.int32(-1),
             physics_obs=self._engine.observe(physics),
-            obs=Observation(blank, blank, hand),  # pyright: ignore[reportArgumentType]
+            obs=Observation(blank, blank, hand),
             centroids=blank,
-            num_pushes=jnp.int32(pushes),
+            num_pushes=jnp.int32(0),
         )
         return self._rebuilt(bank).look(state, hand)
-
-    num_velocities = 0
 
     def _propose_one(self, state: EnvState, key: jax.Array) -> jax.Array:
         env = self._env
@@ -149,8 +150,8 @@ class Rollout:
         ahead = jnp.stack([scripts.make_straight(env)(state, key), scripts.make_clear(env)(state, key)])
         return jnp.concatenate([ahead, guided, uniform])
 
-    def _value_map(self, params: Any, obs: Observation, target: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return self._q.values(params, obs, target), self._env.action_mask(obs.hand)
+    def _values_one(self, params: Any, obs: Observation, target: jax.Array) -> jax.Array:
+        return jnp.where(self._env.action_mask(obs.hand), self._q.values(params, obs, target), -jnp.inf)
 
     def _before_push(
         self, bank: HullBank, params: Any, states: EnvState, actions: jax.Array, execute: jax.Array

@@ -1,140 +1,138 @@
 """Which of several first pushes does best: rounds of simulations, in each of which fewer candidates stay."""
 
 import time
-from typing import Any
+from dataclasses import dataclass
+from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from pregrasp_jax.config import PlanningConfig
-from pregrasp_jax.planning.rollout import Pushed, Rollout
+from pregrasp_jax.planning.rollout import Rollout
 from pregrasp_jax.types import EnvState, HullBank
 
-SUCCESS, FAILURE = 1.0, 0.0
+ROUNDS = (8, 4)
+"""Candidates that stay for the second round and for the third."""
+
+DISCOUNT = 0.97
+"""What a success one push later is worth."""
+
+SALVAGE = 0.6
+"""Share of its worth that a line keeps whose continuation failed: another push can be chosen then."""
+
+_LOWEST, _SLOPE, _HIGHEST = 0.2, 0.45, 0.95
+
+
+class Choice(NamedTuple):
+    """The result of a search.
+
+    Attributes:
+        action: flat index of Q.
+        pushes: simulated, grasps not counted.
+    """
+
+    action: int
+    pushes: int
+
+
+@dataclass
+class Line:
+    """A candidate in one variant of the rebuilt scene, as far as it has been followed.
+
+    Attributes:
+        candidate: which.
+        variant: which.
+        action: what is pushed next.
+        state: where it stands.
+        depth: pushes so far.
+        worth: how likely it ends in a success, discounted by the pushes that takes.
+        ended: nothing follows.
+    """
+
+    candidate: int
+    variant: int
+    action: int
+    state: EnvState
+    depth: int = 0
+    worth: float = 0.0
+    ended: bool = False
 
 
 def chance(values: np.ndarray) -> np.ndarray:
-    """Return how likely an episode succeeds whose best push the network values at [...]."""
-    return np.clip(0.2 + 0.45 * values, 0.0, 0.95)
+    """Return how likely an episode ends well, [...], whose best push the network values at [...]."""
+    return np.clip(_LOWEST + _SLOPE * values, 0.0, _HIGHEST)
 
 
-class Line:
-    """A candidate in one variant of the scene, as far as it has been followed."""
+def search(
+    rollout: Rollout, bank: HullBank, roots: EnvState, candidates: list[int], config: PlanningConfig, deadline: float
+) -> Choice:
+    """Return the candidate that does best on average over variants.
 
-    def __init__(self, candidate: int, variant: int):
-        self.candidate, self.variant, self.depth = candidate, variant, 0
-        self.worth, self.ended = 0.0, False
-        self.state: Any = None
-        self.next_action = -1
-        self.enclosed = False
-
-
-class Search:
-    """One decision."""
-
-    def __init__(
-        self,
-        rollout: Rollout,
-        bank: HullBank,
-        roots: EnvState,
-        candidates: np.ndarray,
-        config: PlanningConfig,
-        begin: float,
-    ):
-        self._rollout, self._bank, self._roots = rollout, bank, roots
-        self._candidates, self._config, self._begin = candidates, config, begin
-        self._lines: dict[tuple[int, int], Line] = {}
-        self.pushes = 0
-
-    def run(self) -> int:
-        """Return the best first push, flat index of Q."""
-        order = list(range(len(self._candidates)))
-        self._open([(candidate, 0) for candidate in order])
-        for keep in self._config.rounds:
-            if self._out_of_time():
-                break
-            order = self._ranked()[:keep]
-            self._widen(order)
-        return int(self._candidates[self._ranked()[0]])
-
-    def _out_of_time(self) -> bool:
-        limit = self._config.budget_ms
-        return limit > 0 and (time.perf_counter() - self._begin) * 1e3 > 0.6 * limit
-
-    def _ranked(self) -> list[int]:
-        """Return the candidates, best first: those followed in most variants before the others."""
-        lines = self._lines.values()
-        worth = {c: [line.worth for line in lines if line.candidate == c] for c in range(len(self._candidates))}
-        return sorted(worth, key=lambda c: (-len(worth[c]), -float(np.mean(worth[c])), c))
-
-    def _widen(self, order: list[int]) -> None:
-        """Follow the lines of some candidates one push further, and open another variant of each."""
-        fresh, further = [], []
-        for candidate in order:
-            variants = [line.variant for line in self._lines.values() if line.candidate == candidate]
-            if len(variants) < self._config.variants:
-                fresh.append((candidate, len(variants)))
-            further += [line for line in self._lines.values() if line.candidate == candidate and self._open_ended(line)]
-        self._advance(further)
-        self._open(fresh)
-
-    def _open_ended(self, line: Line) -> bool:
-        return not line.ended and line.depth <= self._config.depth
-
-    def _open(self, pairs: list[tuple[int, int]]) -> None:
-        lines = [Line(candidate, variant) for candidate, variant in pairs]
-        if not lines:
-            return
-        roots = self._rollout.take(self._roots, self._padded([line.variant for line in lines]))
-        self._follow(lines, roots, np.array([self._candidates[line.candidate] for line in lines]))
-        self._lines |= {(line.candidate, line.variant): line for line in lines}
-
-    def _advance(self, lines: list[Line]) -> None:
-        for start in range(0, len(lines), self._rollout.batch):
-            part = lines[start : start + self._rollout.batch]
-            states = _stack([part[i].state for i in self._padded(range(len(part)))])
-            self._follow(part, states, np.array([line.next_action for line in part]))
-
-    def _padded(self, index: Any) -> np.ndarray:
-        index = np.asarray(list(index))
-        return np.concatenate([index, np.repeat(index[-1:], self._rollout.batch - len(index))])
-
-    def _follow(self, lines: list[Line], states: EnvState, actions: np.ndarray) -> None:
-        """Push once more on every line."""
-        batch, count = self._rollout.batch, len(lines)
-        execute = np.arange(batch) < count
-        padded = np.concatenate([actions, np.repeat(actions[-1:], batch - count)]).astype(np.int32)
-        pushed = self._rollout.push(self._bank, states, padded, execute)
-        self.pushes += count
-        reason = np.asarray(pushed.results.reason)[:count]
-        terminated = np.asarray(pushed.results.terminated)[:count]
-        success = np.asarray(self._rollout.succeeded(reason))
-        held = success.copy()
-        if self._config.grasp and success.any():
-            tried = np.zeros(batch, bool)
-            tried[:count] = success
-            held = self._rollout.grasp(self._bank, pushed.states, tried)[:count]
-        worth = chance(np.asarray(pushed.values)[:count])
-        discount = self._config.discount ** np.array([line.depth for line in lines])
-        for i, line in enumerate(lines):
-            if held[i]:
-                line.worth = SUCCESS * discount[i]
-            elif terminated[i]:
-                line.worth = FAILURE if line.depth == 0 else self._config.salvage * line.worth
-            else:
-                line.worth = self._config.discount * discount[i] * worth[i]
-            line.ended = bool(terminated[i])
-            line.depth += 1
-            line.next_action = int(pushed.actions[i])
-        self._keep_states(lines, pushed)
-
-    def _keep_states(self, lines: list[Line], pushed: Pushed) -> None:
-        for i, line in enumerate(lines):
-            line.state = (pushed.states, i)
+    Args:
+        rollout: simulates.
+        bank: the objects of all variants.
+        roots: [V] the rebuilt scene in all variants, as host arrays.
+        candidates: flat indices of Q, at least one.
+        config: how deep, in how many variants.
+        deadline: by `time.perf_counter`; no round begins that would not end before it.
+    """
+    lines: list[Line] = []
+    kept, last = len(candidates), 0.0
+    for keep in (len(candidates), *ROUNDS):
+        begin = time.perf_counter()
+        if lines and begin + last > deadline:
+            break
+        kept = min(kept, keep)
+        best = _ranked(lines, len(candidates))[:kept]
+        further = [line for line in lines if line.candidate in best and not line.ended and line.depth <= config.depth]
+        fresh = _in_another_variant(lines, best, candidates, roots, config.variants)
+        _follow(rollout, bank, further + fresh)
+        lines += fresh
+        last = time.perf_counter() - begin
+    return Choice(candidates[_ranked(lines, len(candidates))[0]], sum(line.depth for line in lines))
 
 
-def _stack(parts: list[tuple[EnvState, int]]) -> EnvState:
-    """Return states picked from several batches."""
-    import jax
+def _ranked(lines: list[Line], count: int) -> list[int]:
+    """Return `count` candidates, best first: those tried in more variants before the others."""
+    worth = [[line.worth for line in lines if line.candidate == candidate] for candidate in range(count)]
+    return sorted(range(count), key=lambda c: (-len(worth[c]), -sum(worth[c]), c))
 
-    leaves = [jax.tree.map(np.asarray, states) for states, _ in parts]
-    return jax.tree.map(lambda *rows: np.stack([row[i] for row, (_, i) in zip(rows, parts, strict=True)]), *leaves)
+
+def _in_another_variant(
+    lines: list[Line], best: list[int], candidates: list[int], roots: EnvState, num_variants: int
+) -> list[Line]:
+    """Return the beginnings of lines of the best candidates in the first variants that they were not tried in."""
+    fresh = []
+    for candidate in best:
+        variant = sum(line.candidate == candidate for line in lines)
+        if variant < num_variants:
+            state = jax.tree.map(lambda leaf, v=variant: leaf[v], roots)
+            fresh.append(Line(candidate, variant, candidates[candidate], state))
+    return fresh
+
+
+def _follow(rollout: Rollout, bank: HullBank, lines: list[Line]) -> None:
+    """Push once more on every line, a batch at a time."""
+    for start in range(0, len(lines), rollout.batch):
+        _follow_batch(rollout, bank, lines[start : start + rollout.batch])
+
+
+def _follow_batch(rollout: Rollout, bank: HullBank, lines: list[Line]) -> None:
+    padded = lines + lines[-1:] * (rollout.batch - len(lines))
+    real = np.arange(rollout.batch) < len(lines)
+    states = jax.tree.map(lambda *leaves: np.stack(leaves), *(line.state for line in padded))
+    pushed = rollout.push(bank, states, np.array([line.action for line in padded], np.int32), real)
+    held = rollout.grasp(bank, pushed.states, real & rollout.succeeded(pushed.results.reason))
+    host = jax.device_get(pushed.states)
+    chances = chance(np.asarray(pushed.values))
+    for i, line in enumerate(lines):
+        discount = DISCOUNT**line.depth
+        if held[i]:
+            line.worth = discount
+        elif pushed.results.terminated[i]:
+            line.worth = SALVAGE * line.worth  # 0 for the candidate itself
+        else:
+            line.worth = discount * DISCOUNT * float(chances[i])
+        line.ended = bool(pushed.results.terminated[i])
+        line.action, line.depth = int(pushed.actions[i]), line.depth + 1
+        line.state = jax.tree.map(lambda leaf, i=i: leaf[i], host)

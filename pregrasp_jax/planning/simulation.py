@@ -13,7 +13,6 @@ import numpy as np
 from mujoco.batch import Batch
 
 from pregrasp_jax.physics import native
-from pregrasp_jax.physics.base import Engine
 from pregrasp_jax.planning.solids import NUM_SIDES, Frustums, hull_bank
 from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.scene import model as slot_model
@@ -57,6 +56,12 @@ class Simulations(native.Simulations):
             self._variants[: len(wanted)] = wanted
             self._set_models()
 
+    def place(self, poses: np.ndarray, joint_pos: np.ndarray) -> np.ndarray:
+        """Return qpos [V, nq] float32 with the objects at poses [V, MAX_OBJECTS, 7] and the robot at joints [J]."""
+        qpos = np.tile(self.coordinates(self.home_state())[0], (len(poses), 1))
+        qpos[:, self._joint_ids], qpos[:, self.model.slot_qpos_ids] = joint_pos, poses
+        return qpos.astype(np.float32)
+
     def write(self, bank: HullBank) -> None:
         """Put the objects of a rebuilt bank (`num_variants` times MAX_OBJECTS) into the models; no call may be running."""
         with self._lock:
@@ -78,11 +83,6 @@ def make_simulations(robot: Robot, workspace: Workspace, *, num_variants: int, t
     spec.option.timestep, spec.option.iterations = TIMESTEP, ITERATIONS
     model = slot_model.make_slot_model(spec, _template())
     return Simulations(model, robot, num_variants=num_variants, threads=threads)
-
-
-def make_engine(simulations: Simulations, robot: Robot) -> Engine:
-    """Return the engine of rebuilt objects."""
-    return native.engine_of(simulations, robot)
 
 
 def _template() -> HullBank:
