@@ -153,7 +153,9 @@ class Evaluator:
         finish(self._grasp_all(enclosed))
         return EvaluationResult(tuple(sorted(finished, key=lambda episode: episode.scene)))
 
-    def play(self, policy: Policy | Planner, scene: int, *, seed: int = 0, with_grasp: bool = True) -> Iterator[Decision]:
+    def play(
+        self, policy: Policy | Planner, scene: int, *, seed: int = 0, with_grasp: bool = True
+    ) -> Iterator[Decision]:
         """Yield the decisions of one scene, the last of which is the end of the episode: exactly what `run` counts.
 
         Args:
@@ -197,7 +199,9 @@ class Evaluator:
         """Return the function that lets a policy decide once more in every scene of a batch, and pushes."""
         if isinstance(policy, Planner):
             deliberation = Deliberation(policy, key)
-            return lambda runs: self._call(self._act, runs, deliberation(runs.state, np.asarray(runs.reason) == RUNNING))
+            return lambda runs: self._call(
+                self._act, runs, deliberation(runs.state, np.asarray(runs.reason) == RUNNING)
+            )
         bound = _bound(policy)
         return lambda runs: self._call(self._push, bound, runs, key)
 

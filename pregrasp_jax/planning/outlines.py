@@ -7,7 +7,7 @@ a fifth of a cell.
 
 import numpy as np
 
-from pregrasp_jax.planning.solids import NUM_SIDES, ROUNDING, Frustums, area, directions
+from pregrasp_jax.planning.solids import NUM_SIDES, Frustums, area, directions
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.types import MAX_HULLS
 
@@ -65,14 +65,7 @@ def outline(xy: np.ndarray, angle: float, *, edge: float = 0.0) -> np.ndarray:
     quadratic = (two - 2 * one + start) / 2
     linear = one - start - quadratic
     root = (-linear + np.sqrt(max(linear**2 - 4 * quadratic * (start - wanted), 0.0))) / (2 * quadratic)
-    grown = support + np.clip(root * _CELL, *_GAP) - edge
-    return _tight(grown, xy.mean(axis=0), angle)
-
-
-def _tight(support: np.ndarray, centre: np.ndarray, angle: float) -> np.ndarray:
-    """Return a support in which every side is at least a little long: `ROUNDING` of the outline is a circle."""
-    middle = directions(np.asarray(angle)) @ centre
-    return middle + np.maximum(support - middle - ROUNDING, 1e-3) + ROUNDING
+    return support + np.clip(root * _CELL, *_GAP) - edge
 
 
 def turn_of(xy: np.ndarray) -> float:
@@ -81,9 +74,7 @@ def turn_of(xy: np.ndarray) -> float:
     return float(_TURNS[np.argmin(area(support))])
 
 
-def _layers(
-    xy: np.ndarray, height: np.ndarray, edge: float, most: int
-) -> list[tuple[np.ndarray, np.ndarray, float]]:
+def _layers(xy: np.ndarray, height: np.ndarray, edge: float, most: int) -> list[tuple[np.ndarray, np.ndarray, float]]:
     """Return (support [2, NUM_SIDES], z [2], angle) of the layers of a part, from the table up."""
     top = max(float(height.max()), _MIN_HEIGHT)
     levels = np.linspace(0.0, top, _NUM_LEVELS + 1)

@@ -6,7 +6,7 @@ import numpy as np
 
 from pregrasp_jax.assets.bank import DEFAULT_DENSITY, DEFAULT_FRICTION
 from pregrasp_jax.planning.memory import Memory, solids_of
-from pregrasp_jax.planning.solids import Frustums, hull_bank
+from pregrasp_jax.planning.solids import Frustums, hull_bank, tighten
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.types import MAX_OBJECTS, ROBOT_ID, TABLE_ID, HullBank, Observation
@@ -45,7 +45,7 @@ def draw_variants(memory: Memory, count: int, rng: np.random.Generator) -> Varia
     density = DEFAULT_DENSITY * MASS_JITTER ** (disturbed * rng.uniform(-1, 1, shape))
     off = rng.standard_normal((*shape, 3)) * [POSITION_JITTER, POSITION_JITTER, TURN_JITTER]
     varied = Frustums(*(np.broadcast_to(column, (count, *column.shape)) for column in solids))
-    varied = varied._replace(support=varied.support + grown[..., None, None, None])
+    varied = varied._replace(support=tighten(varied.support + grown[..., None, None, None]))
     flat = Frustums(*(column.reshape(-1, *column.shape[2:]) for column in varied))
     bank = hull_bank(flat, density=density.ravel(), friction=DEFAULT_FRICTION)
     standing = _standing(poses + disturbed[..., None] * off)

@@ -104,7 +104,7 @@ class _Writer:
     def __init__(self, model: SlotModel):
         mj_model = model.mj_model
         self._model = model
-        meshes = mj_model.geom_dataid[model.slot_geom_ids]
+        meshes = np.arange(MAX_OBJECTS * MAX_HULLS).reshape(MAX_OBJECTS, MAX_HULLS)  # one for every geom of a slot
         self._vertex_ids = mj_model.mesh_vertadr[meshes][..., None] + np.arange(_NUM_VERTICES)
         self._polygon_ids, self._face_ids = self._polygons(mj_model, meshes)
         self._mesh_ids = meshes
@@ -143,6 +143,7 @@ class _Writer:
         target.mesh_polynormal[self._polygon_ids] = np.take_along_axis(normals, self._face_ids[..., None], axis=-2)
         farthest = np.argmax(np.einsum("...vi,di->...dv", points, _EXTREMA), axis=-1)
         target.mesh_extrema[self._mesh_ids] = np.take_along_axis(self._local_ids, farthest, axis=-1)
+        target.geom_dataid[geoms] = self._mesh_ids
         target.geom_pos[geoms], target.geom_quat[geoms] = centre, [1.0, 0.0, 0.0, 0.0]
         target.geom_size[geoms] = (high - low) / 2
         target.geom_aabb[geoms] = np.concatenate([np.zeros_like(centre), (high - low) / 2], axis=-1)

@@ -7,7 +7,6 @@ them: only numbers change, never the graph that MuJoCo walks along.
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax.types import FULL_TOPOLOGY, MAX_HULLS, HullBank, Hulls
@@ -15,9 +14,8 @@ from pregrasp_jax.types import FULL_TOPOLOGY, MAX_HULLS, HullBank, Hulls
 NUM_SIDES = 16
 """Directions of sides; a circle is met within 2 % of its radius, and a rectangle that one of them follows exactly."""
 
-ROUNDING = 1e-3
-"""m; sides are cut off so that none is shorter than 0.4 times this: MuJoCo's search on the graph must not meet two vertices
-in one place."""
+MIN_SIDE = 3e-4
+"""m, shortest side of a polygon: MuJoCo's search on the graph of a hull must not meet two vertices in one place."""
 
 _ANGLES = 2 * np.pi * np.arange(NUM_SIDES) / NUM_SIDES
 
@@ -52,6 +50,18 @@ def corners(support: np.ndarray, angle: np.ndarray) -> np.ndarray:
     normal = directions(angle)
     tangent = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
     return support[..., None] * normal + along[..., None] * tangent
+
+
+def tighten(support: np.ndarray) -> np.ndarray:
+    """Return the largest support [..., NUM_SIDES] below the one given of which every side is at least `MIN_SIDE` long."""
+    step = 2 * np.pi / NUM_SIDES
+    for _ in range(8 * NUM_SIDES):
+        beside = np.roll(support, 1, axis=-1) + np.roll(support, -1, axis=-1)
+        allowed = (beside - 1.01 * MIN_SIDE * np.sin(step)) / (2 * np.cos(step))
+        if (support <= allowed + 1e-3 * MIN_SIDE).all():
+            break
+        support = np.minimum(support, allowed)
+    return support
 
 
 def area(support: np.ndarray) -> np.ndarray:
@@ -92,7 +102,12 @@ def edges() -> np.ndarray:
     """Return the edges [3 NUM_SIDES, 2] of every frustum: round the bottom, round the top, upward."""
     k = np.arange(NUM_SIDES)
     following = (k + 1) % NUM_SIDES
-    return np.concatenate([np.stack(pair, axis=1) for pair in ((k, following), (k + NUM_SIDES, following + NUM_SIDES), (k, k + NUM_SIDES))])
+    return np.concatenate(
+        [
+            np.stack(pair, axis=1)
+            for pair in ((k, following), (k + NUM_SIDES, following + NUM_SIDES), (k, k + NUM_SIDES))
+        ]
+    )
 
 
 class MassProperties(NamedTuple):
