@@ -19,13 +19,13 @@ _LAYER_COST = 0.02
 """Share of an object's volume that another layer must explain."""
 
 _MAX_LAYERS = 4
-_CONVEX = 0.88
+_CONVEX = 0.92
 """A footprint that fills less of its convex outline is divided."""
 
 _NUM_CUTS, _CUTS = 8, (0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9)
 """Directions and places, as shares of the cells, in which a division is tried."""
 
-_WORTH_A_CUT = 0.93
+_WORTH_A_CUT = 0.95
 """Two outlines must be this much smaller than one."""
 
 _MIN_CELLS = 3

@@ -6,6 +6,7 @@ import numpy as np
 
 from pregrasp_jax.assets.bank import DEFAULT_DENSITY, DEFAULT_FRICTION
 from pregrasp_jax.planning.memory import Memory, solids_of
+from pregrasp_jax.planning.separate import separate
 from pregrasp_jax.planning.solids import Frustums, hull_bank, tighten
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.spaces import grid
@@ -19,6 +20,9 @@ POSITION_JITTER, TURN_JITTER, SIZE_JITTER, MASS_JITTER = 2e-3, 0.03, 0.7e-3, 1.6
 
 _RAYS = np.linspace(0.02, 0.3, 15)
 """Shares of the way from the table to a camera 1 m above it at which something may stand in between."""
+
+
+_NOWHERE = np.array([9.0, 9.0, 0.0])
 
 
 class Variants(NamedTuple):
@@ -38,18 +42,22 @@ class Variants(NamedTuple):
 def draw_variants(memory: Memory, count: int, rng: np.random.Generator) -> Variants:
     """Return the rebuilt scene, and `count` - 1 others that look much the same."""
     solids, known = solids_of(memory)
-    poses = np.stack([shape.pose if shape is not None else np.zeros(3) for shape in memory])
+    poses = np.stack([shape.pose if shape is not None else _NOWHERE for shape in memory])
     disturbed = (np.arange(count) > 0)[:, None]
     shape = (count, MAX_OBJECTS)
     grown = disturbed * SIZE_JITTER * rng.standard_normal(shape) - SHRINK
     density = DEFAULT_DENSITY * MASS_JITTER ** (disturbed * rng.uniform(-1, 1, shape))
     off = rng.standard_normal((*shape, 3)) * [POSITION_JITTER, POSITION_JITTER, TURN_JITTER]
-    varied = Frustums(*(np.broadcast_to(column, (count, *column.shape)) for column in solids))
-    varied = varied._replace(support=tighten(varied.support + grown[..., None, None, None]))
-    flat = Frustums(*(column.reshape(-1, *column.shape[2:]) for column in varied))
-    bank = hull_bank(flat, density=density.ravel(), friction=DEFAULT_FRICTION)
-    standing = _standing(poses + disturbed[..., None] * off)
-    return Variants(bank, np.where(known[:, None], standing, parking_poses()).astype(np.float32), known)
+    places = poses + disturbed[..., None] * off
+    varied = [
+        separate(solids._replace(support=tighten(solids.support + size[:, None, None, None])), place)
+        for size, place in zip(grown, places, strict=True)
+    ]
+    joined = Frustums(*(np.concatenate(columns) for columns in zip(*varied, strict=True)))
+    bank = hull_bank(joined, density=density.ravel(), friction=DEFAULT_FRICTION)
+    hulls = np.where(np.tile(known, count)[:, None], bank.object_hulls, -1)
+    standing = np.where(known[:, None], _standing(places), parking_poses()).astype(np.float32)
+    return Variants(bank.replace(object_hulls=hulls), standing, known)
 
 
 def hidden_cells(obs: Observation, camera: np.ndarray | None) -> np.ndarray:
