@@ -1,5 +1,6 @@
 """A policy that simulates before it pushes, in a scene rebuilt from what the camera sees."""
 
+import functools
 import math
 import time
 from typing import Any, NamedTuple
@@ -8,7 +9,7 @@ import jax
 import numpy as np
 
 from pregrasp_jax.config import PlanningConfig, to_dict
-from pregrasp_jax.heightmap import overhead_camera
+from pregrasp_jax.heightmap import overhead_camera, robot_hulls
 from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.planning import memory as remembering
 from pregrasp_jax.planning import simulation
@@ -56,6 +57,7 @@ class Planner:
             env.robot, env.workspace, num_variants=config.variants, threads=threads
         )
         self._rollout = Rollout(env, self._simulations, q_function, params, batch=BATCH)
+        self._place_robot = jax.jit(functools.partial(robot_hulls, env.robot))
         self._camera = None if env.task.camera == "orthographic" else np.asarray(overhead_camera().position)
         self._seconds: list[float] = []
         self._pushes: list[int] = []
@@ -91,10 +93,13 @@ class Planner:
         per_decision = {name: round(float(np.mean(values or [0.0])), 3) for name, values in mean.items()}
         return {"settings": to_dict(self._config), "per_decision": per_decision}
 
+    def _robot_at(self, sight: Sight) -> np.ndarray:
+        return np.asarray(self._place_robot(sight.joint_pos).vertices)
+
     def _rebuild(self, sight: Sight, memory: Memory, key: jax.Array) -> tuple[HullBank, EnvState]:
         """Write the variants of the rebuilt scene into the simulations; return their objects and their states [V]."""
         seed = np.asarray(jax.random.key_data(key)).tolist()
-        variants = draw_variants(memory, self._config.variants, np.random.default_rng(seed))
+        variants = draw_variants(memory, self._robot_at(sight), self._config.variants, np.random.default_rng(seed))
         self._simulations.write(variants.bank)
         ids = np.arange(self._config.variants * MAX_OBJECTS).reshape(-1, MAX_OBJECTS)
         object_ids = np.where(variants.known, ids, -1).astype(np.int32)

@@ -39,8 +39,15 @@ class Variants(NamedTuple):
     known: np.ndarray
 
 
-def draw_variants(memory: Memory, count: int, rng: np.random.Generator) -> Variants:
-    """Return the rebuilt scene, and `count` - 1 others that look much the same."""
+def draw_variants(memory: Memory, robot: np.ndarray, count: int, rng: np.random.Generator) -> Variants:
+    """Return the rebuilt scene, and `count` - 1 others that look much the same.
+
+    Args:
+        memory: what is known of the objects.
+        robot: [R, V, 3] m, vertices of the hulls of the robot where it stands.
+        count: of scenes.
+        rng: for the others.
+    """
     solids, known = solids_of(memory)
     poses = np.stack([shape.pose if shape is not None else _NOWHERE for shape in memory])
     disturbed = (np.arange(count) > 0)[:, None]
@@ -50,7 +57,7 @@ def draw_variants(memory: Memory, count: int, rng: np.random.Generator) -> Varia
     off = rng.standard_normal((*shape, 3)) * [POSITION_JITTER, POSITION_JITTER, TURN_JITTER]
     places = poses + disturbed[..., None] * off
     varied = [
-        separate(solids._replace(support=tighten(solids.support + size[:, None, None, None])), place)
+        separate(solids._replace(support=tighten(solids.support + size[:, None, None, None])), place, robot)
         for size, place in zip(grown, places, strict=True)
     ]
     joined = Frustums(*(np.concatenate(columns) for columns in zip(*varied, strict=True)))

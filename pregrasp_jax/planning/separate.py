@@ -1,4 +1,4 @@
-"""Rebuilt objects must not overlap: a convex outline bridges hollows in which a neighbour may stand."""
+"""Rebuilt objects overlap neither each other nor the robot: a convex outline bridges hollows in which either may be."""
 
 import numpy as np
 
@@ -8,12 +8,13 @@ ALLOWED = 3e-4
 """m of overlap that stays."""
 
 
-def separate(solids: Frustums, poses: np.ndarray) -> Frustums:
-    """Return objects cut back to where they no longer overlap, along the sides where that takes least.
+def separate(solids: Frustums, poses: np.ndarray, robot: np.ndarray) -> Frustums:
+    """Return objects cut back to where nothing overlaps, along the sides where that takes least.
 
     Args:
         solids: [N, P] frustums in the frames of their objects.
         poses: [N, 3] m, m, rad: x, y and heading of the objects.
+        robot: [R, V, 3] m, vertices of its hulls in the world; they stay as they are.
     """
     owner, part = np.nonzero(solids.present)
     support, height = solids.support[owner, part].copy(), solids.height[owner, part]
@@ -21,17 +22,21 @@ def separate(solids: Frustums, poses: np.ndarray) -> Frustums:
     normal = directions(world)
     outward = support + (normal @ poses[owner, :2, None])[:, None, :, 0]
     flat = corners(outward, world[:, None]).reshape(len(owner), 2 * NUM_SIDES, 2)
-    # How far each part lies beyond every side of each other one, m: [of whom, side, who].
-    gap = np.einsum("pki,qvi->pkqv", normal, flat).min(axis=-1) - outward.max(axis=1)[:, :, None]
-    widest = gap.max(axis=1)
-    best = np.maximum(widest, widest.T)
-    level = np.minimum(height[:, None, 1], height[None, :, 1]) - np.maximum(height[:, None, 0], height[None, :, 0])
-    meets = (owner[:, None] < owner[None]) & (level > 0) & (best < -ALLOWED)
-    for first, second in np.argwhere(meets):
-        cut, other = (first, second) if widest[first, second] >= widest[second, first] else (second, first)
+    points = [flat, robot[..., :2]]
+    levels = np.concatenate([height, np.stack([robot[..., 2].min(axis=1), robot[..., 2].max(axis=1)], axis=1)])
+    # How far everything lies beyond every side of each part, m: [of whom, side, who].
+    reach = np.concatenate([np.einsum("pki,qvi->pkqv", normal, set_).min(axis=-1) for set_ in points], axis=-1)
+    gap = reach - outward.max(axis=1)[:, :, None]
+    count, widest = len(owner), gap.max(axis=1)
+    best = widest.copy()
+    best[:, :count] = np.maximum(widest[:, :count], widest[:, :count].T)
+    shared = np.minimum(height[:, None, 1], levels[None, :, 1]) - np.maximum(height[:, None, 0], levels[None, :, 0])
+    owners = np.append(owner, np.full(len(robot), len(poses)))
+    for first, second in np.argwhere((owner[:, None] < owners[None]) & (shared > 0) & (best < -ALLOWED)):
+        cut, other = (first, second) if widest[first, second] >= best[first, second] else (second, first)
         side = int(np.argmax(gap[cut, :, other]))
-        limit = support[cut, :, side].max() + gap[cut, side, other] + ALLOWED
-        support[cut, :, side] = np.minimum(support[cut, :, side], limit)
+        beyond = solids.support[owner[cut], part[cut], :, side].max() + gap[cut, side, other]
+        support[cut, :, side] = np.minimum(support[cut, :, side], beyond + ALLOWED)
     result = solids.support.copy()
     result[owner, part] = tighten(support)
     return solids._replace(support=result)
