@@ -60,7 +60,16 @@ class Simulations(native.Simulations):
         """Return qpos [V, nq] float32 with the objects at poses [V, MAX_OBJECTS, 7] and the robot at joints [J]."""
         qpos = np.tile(self.coordinates(self.home_state())[0], (len(poses), 1))
         qpos[:, self._joint_ids], qpos[:, self.model.slot_qpos_ids] = joint_pos, poses
+        self._couple(qpos)
         return qpos.astype(np.float32)
+
+    def _couple(self, qpos: np.ndarray) -> None:
+        """Put the joints that others drive, such as finger tips, where these want them; qpos [V, nq] is changed."""
+        model = self.model.mj_model
+        for index in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+            driven, driver = (model.jnt_qposadr[ids[index]] for ids in (model.eq_obj1id, model.eq_obj2id))
+            moved = qpos[:, driver] - model.qpos0[driver]
+            qpos[:, driven] = model.qpos0[driven] + np.polyval(model.eq_data[index, 4::-1], moved)
 
     def write(self, bank: HullBank) -> None:
         """Put the objects of a rebuilt bank (`num_variants` times MAX_OBJECTS) into the models; no call may be running."""
