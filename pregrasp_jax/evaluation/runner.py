@@ -103,7 +103,6 @@ class Evaluator:
         enclosed = jax.eval_shape(self._start, np.zeros(self._num_envs, np.int32))
         self._program(self._start, indices)
         if isinstance(policy, Planner):
-            policy.compile()
             self._program(self._act, runs, indices)
         else:
             self._program(self._push, _bound(policy), runs, jax.random.key(0))

@@ -10,7 +10,7 @@ from pregrasp_jax.spaces import grid
 from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, Observation
 
 _HIDDEN = 0.93
-"""An object beside something that hides it, of which less than this share is seen of what was seen before, is hidden."""
+"""An object beside what hides it is itself hidden if less than this share is seen of what was seen before."""
 
 _MIN_MATCH = 0.6
 """Share of the cells that must agree, else the remembered shape is not what is seen now: it fell, perhaps."""
@@ -167,7 +167,7 @@ class _Score:
 
 
 def solids_of(memory: Memory) -> tuple[Frustums, np.ndarray]:
-    """Return the frustums [MAX_OBJECTS, MAX_HULLS] of all objects in their own frames, and which are known [MAX_OBJECTS]."""
+    """Return the frustums [MAX_OBJECTS, MAX_HULLS] of all objects in their own frames, and which are known."""
     known = np.array([shape is not None for shape in memory])
     blank = next(shape for shape in memory if shape is not None).solids
     rows = [(shape.solids if shape is not None else blank) for shape in memory]

@@ -1,8 +1,8 @@
 """From the cells of one object to a stack of frustums.
 
-A cell belongs to an object if its centre does, so that the number of cells is an unbiased measure of the area. The convex
-outline of the centres is therefore grown until it has that area: on smooth objects this meets the true outline within 1 mm,
-a fifth of a cell.
+A cell belongs to an object if its centre does, so that the number of cells is an unbiased measure of the area. The
+convex outline of the centres is therefore grown until it has that area: on smooth objects this meets the true outline
+within 1 mm, a fifth of a cell.
 """
 
 import numpy as np
@@ -69,7 +69,7 @@ def outline(xy: np.ndarray, angle: float, *, edge: float = 0.0) -> np.ndarray:
 
 
 def turn_of(xy: np.ndarray) -> float:
-    """Return the turn, rad, of the directions in which the outline of cells [N, 2] is smallest: along straight sides."""
+    """Return the turn, rad, of the directions for which the outline of cells [N, 2] is smallest: along its sides."""
     support = (directions(_TURNS) @ xy.T).max(axis=-1) + _CELL / 2
     return float(_TURNS[np.argmin(area(support))])
 
@@ -112,7 +112,7 @@ def _pieces(values: np.ndarray, most: int) -> list[tuple[int, int]]:
 
 
 def _misfit(values: np.ndarray) -> np.ndarray:
-    """Return how far values [L] are from the line through the ends of every run, [first, last]; inf where last < first."""
+    """Return how far values [L] are from a line through the ends of every run, [first, last]; inf if last < first."""
     index = np.arange(len(values))
     first, last, at = index[:, None, None], index[None, :, None], index[None, None, :]
     share = (at - first) / np.maximum(last - first, 1)

@@ -20,7 +20,9 @@ DISCOUNT = 0.97
 SALVAGE = 0.6
 """Share of its worth that a line keeps whose continuation failed: another push can be chosen then."""
 
-_LOWEST, _SLOPE, _HIGHEST = 0.2, 0.45, 0.95
+_VALUES, _CHANCES = (0.4, 0.9, 1.2, 1.5, 2.0), (0.05, 0.25, 0.65, 0.8, 0.97)
+"""How often episodes of `pretrained` ended well, by what it said of its best push: 200 episodes on validation scenes of
+built-in objects and of distorted ones."""
 
 
 class Choice(NamedTuple):
@@ -60,7 +62,7 @@ class Line:
 
 def chance(values: np.ndarray) -> np.ndarray:
     """Return how likely an episode ends well, [...], whose best push the network values at [...]."""
-    return np.clip(_LOWEST + _SLOPE * values, 0.0, _HIGHEST)
+    return np.interp(values, _VALUES, _CHANCES)
 
 
 def search(

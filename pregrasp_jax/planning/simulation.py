@@ -1,8 +1,8 @@
 """Simulations of rebuilt objects on the native engine: one compiled model, into which any frustums are written.
 
-`mujoco.batch.Batch` cannot keep vertices for each simulation, but it can run each simulation on a model of its own. So there
-is one copy of the compiled model for every variant of the rebuilt scene, and a decision writes its objects into these copies:
-a millisecond instead of a compilation.
+`mujoco.batch.Batch` cannot keep vertices for each simulation, but it can run each simulation on a model of its own. So
+there is one copy of the compiled model for every variant of the rebuilt scene, and a decision writes its objects into
+these copies: a millisecond instead of a compilation.
 """
 
 import copy
@@ -21,7 +21,7 @@ from pregrasp_jax.spaces.workspace import Workspace
 from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, HullBank
 
 TIMESTEP, ITERATIONS = 0.01, 8
-"""s, and iterations of the solver: half the work of the task's own 0.004 and 20. Of 48 pushes 47 or more ended for the same
+"""s, and iterations of the solver: half the work of the task's own 0.004 and 20. Of 48 pushes all ended for the same
 reason, and 90 % of the objects within 5 mm of where they would be."""
 
 _NUM_VERTICES = 2 * NUM_SIDES
@@ -30,7 +30,7 @@ _EXTREMA = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1
 
 
 class Simulations(native.Simulations):
-    """Native simulations whose objects are written, not chosen: object v * MAX_OBJECTS + s stands in slot s of variant v."""
+    """Native simulations whose objects are written, not chosen: v * MAX_OBJECTS + s stands in slot s of variant v."""
 
     def __init__(self, model: SlotModel, robot: Robot, *, num_variants: int, threads: int = 0):
         """Compile nothing; see `make_simulations`."""
@@ -72,7 +72,7 @@ class Simulations(native.Simulations):
             qpos[:, driven] = model.qpos0[driven] + np.polyval(model.eq_data[index, 4::-1], moved)
 
     def write(self, bank: HullBank) -> None:
-        """Put the objects of a rebuilt bank (`num_variants` times MAX_OBJECTS) into the models; no call may be running."""
+        """Put the objects of a rebuilt bank, `num_variants` times MAX_OBJECTS, into the models."""
         with self._lock:
             for variant, target in enumerate(self._models):
                 self._writer.write(target, self._data, bank, variant * MAX_OBJECTS)

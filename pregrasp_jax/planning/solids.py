@@ -1,13 +1,14 @@
 """Solids that a heightmap can describe: stacks of frustums, all of one topology.
 
-A frustum lies between two horizontal polygons whose sides have the same `NUM_SIDES` directions, so that its own sides are
-planes. Every frustum has the same vertices, edges and faces in the same order. That is why one compiled model can hold any of
-them: only numbers change, never the graph that MuJoCo walks along.
+A frustum lies between two horizontal polygons whose sides have the same `NUM_SIDES` directions, so that its own sides
+are planes. Every frustum has the same vertices, edges and faces in the same order. That is why one compiled model can
+hold any of them: only numbers change, never the graph that MuJoCo walks along.
 """
 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pregrasp_jax.types import FULL_TOPOLOGY, MAX_HULLS, HullBank, Hulls
 
@@ -43,7 +44,7 @@ def directions(angle: np.ndarray) -> np.ndarray:
 
 
 def corners(support: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Return the corners [..., NUM_SIDES, 2] m of polygons with tight `support` [..., NUM_SIDES]; k is between k and k + 1."""
+    """Return the corners [..., NUM_SIDES, 2] m of polygons with tight `support`; k lies between sides k and k + 1."""
     following = np.roll(support, -1, axis=-1)
     step = 2 * np.pi / NUM_SIDES
     along = (following - support * np.cos(step)) / np.sin(step)
@@ -53,7 +54,7 @@ def corners(support: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def tighten(support: np.ndarray) -> np.ndarray:
-    """Return the largest support [..., NUM_SIDES] below the one given of which every side is at least `MIN_SIDE` long."""
+    """Return the largest support [..., NUM_SIDES] below the one given that has no side shorter than `MIN_SIDE`."""
     step = 2 * np.pi / NUM_SIDES
     for _ in range(8 * NUM_SIDES):
         beside = np.roll(support, 1, axis=-1) + np.roll(support, -1, axis=-1)
@@ -205,6 +206,4 @@ def hull_bank(solids: Frustums, *, density: np.ndarray, friction: float) -> Hull
 
 def _quaternions(matrices: np.ndarray) -> np.ndarray:
     """Return wxyz quaternions [N, 4] of rotations [N, 3, 3]."""
-    from scipy.spatial.transform import Rotation
-
     return Rotation.from_matrix(matrices).as_quat(scalar_first=True)
