@@ -20,8 +20,11 @@ from pregrasp_jax.planning.search import search
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.types import MAX_OBJECTS, EnvState, HullBank
 
-BATCH = 16
-"""Pushes simulated at a time."""
+BATCH = 8
+"""Pushes simulated at a time: what pads a batch is drawn and valued for nothing."""
+
+_TRIED = 16
+"""Candidates with those of scripts."""
 
 _APART = 4
 """Cells, 2 cm, between two pushes of one choice that the network proposes."""
@@ -79,7 +82,7 @@ class Planner:
             return Planned(proposed[0] if proposed else 0, memory)
         script_key, variant_key = jax.random.split(key)
         bank, roots = self._rebuild(sight, memory, variant_key)
-        scripted = self._rollout.propose(roots, script_key)[: max(BATCH - len(proposed), 0)]
+        scripted = self._rollout.propose(roots, script_key)[: max(_TRIED - len(proposed), 0)]
         candidates = list(dict.fromkeys([*proposed, *scripted]))
         limit = self._config.budget_ms / 1e3 if self._config.budget_ms else math.inf
         found = search(self._rollout, bank, roots, candidates, self._config, begin + limit)

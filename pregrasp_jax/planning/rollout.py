@@ -1,4 +1,4 @@
-"""Pushes of rebuilt scenes, a batch of one size at a time: simulate, judge by the rules of the task, ask the network."""
+"""Pushes of rebuilt scenes, a batch of one size at a time: simulate, judge by the task's rules, ask the network."""
 
 import dataclasses
 from collections.abc import Callable
