@@ -47,6 +47,10 @@ class Simulations(native.Simulations):
     def _set_models(self) -> None:
         self._batch.set_models([self._models[variant] for variant in self._variants])
 
+    def model_of(self, variant: int) -> mujoco.MjModel:
+        """Return the model that holds the objects of a variant; read it, do not change it."""
+        return self._models[variant]
+
     def load(self, object_ids: np.ndarray) -> None:
         """Let the first E simulations run on the variants that object ids [E, MAX_OBJECTS] belong to."""
         if len(object_ids) > self._batch.nsim:
