@@ -14,7 +14,7 @@ from pregrasp_jax.types import EnvState, HullBank
 ROUNDS = (8, 4)
 """Candidates that stay for the second round and for the third."""
 
-DISCOUNT = 0.97
+DISCOUNT = 0.93
 """What a success one push later is worth."""
 
 SALVAGE = 0.6
@@ -48,6 +48,7 @@ class Line:
         state: where it stands.
         depth: pushes so far.
         worth: how likely it ends in a success, discounted by the pushes that takes.
+        safety: how likely nothing has left the workspace until now.
         ended: nothing follows.
     """
 
@@ -57,6 +58,7 @@ class Line:
     state: EnvState
     depth: int = 0
     worth: float = 0.0
+    safety: float = 1.0
     ended: bool = False
 
 
@@ -128,7 +130,8 @@ def _follow_batch(rollout: Rollout, bank: HullBank, lines: list[Line]) -> None:
     host = jax.device_get(pushed.states)
     chances = chance(np.asarray(pushed.values))
     for i, line in enumerate(lines):
-        discount = DISCOUNT**line.depth
+        line.safety *= float(pushed.safety[i])
+        discount = line.safety * DISCOUNT**line.depth
         if held[i]:
             line.worth = discount
         elif pushed.results.terminated[i]:
