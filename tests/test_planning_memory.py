@@ -38,7 +38,7 @@ def remember(sight: Sight, memory: Memory = NOTHING) -> Memory:
 
 def test_what_the_hand_hides_keeps_its_size_and_place():
     memory = remember(picture([box(0.0, 0.0, 0.3)]))
-    hand = XY[..., 0] < -0.01  # a third of it
+    hand = XY[..., 0] < 0.01  # a third of it
     moved = remember(picture([box(0.02, 0.01, 0.8)], robot=hand), memory)
     blind = remember(picture([box(0.02, 0.01, 0.8)], robot=hand))
     true = 0.09 * 0.05
