@@ -15,8 +15,8 @@ _HIDDEN = 0.93
 _MIN_MATCH = 0.6
 """Share of the cells that must agree, else the remembered shape is not what is seen now: it fell, perhaps."""
 
-PINHOLE_EDGE = 0.0
-"""m by which a pinhole camera's heightmap shows objects too large on all sides."""
+PINHOLE_EDGE = 1.8e-3
+"""m by which a pinhole camera's heightmap shows objects too large on all sides: a cell is theirs if any point is."""
 
 _COARSE = np.deg2rad(np.arange(-180, 180, 15))
 _SHIFTS = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2)

@@ -91,9 +91,9 @@ class Planner:
         return Planned(found.action, memory)
 
     def describe(self) -> dict[str, Any]:
-        """Return the settings of the search, and what a decision took on average until now."""
-        mean = {"seconds": self._seconds, "pushes": self._pushes}
-        per_decision = {name: round(float(np.mean(values or [0.0])), 3) for name, values in mean.items()}
+        """Return the settings of the search, and what decisions took until now (the median; the first one compiles)."""
+        taken = {"seconds": self._seconds, "pushes": self._pushes}
+        per_decision = {name: round(float(np.median(values or [0.0])), 3) for name, values in taken.items()}
         return {"settings": to_dict(self._config), "per_decision": per_decision}
 
     def _robot_at(self, sight: Sight) -> np.ndarray:

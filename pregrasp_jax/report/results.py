@@ -7,7 +7,7 @@ from typing import Any
 
 from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.evaluation import load_evaluation
-from pregrasp_jax.evaluation.statistics import compare
+from pregrasp_jax.evaluation.statistics import compare, policy_name
 from pregrasp_jax.report.markup import Markup, element
 from pregrasp_jax.report.record import RunRecord
 from pregrasp_jax.report.svg import interval_mark
@@ -78,7 +78,7 @@ def missing(run: RunRecord, documents: Sequence[dict[str, Any]]) -> list[tuple[s
     for object_set in sorted(sets):
         present = [document for document in documents if document["object_set"] == object_set]
         names = {document["policy"] for document in present}
-        if not of_run(run, present):
+        if not any(not document.get("planning") for document in of_run(run, present)):
             lacking.append((f"this run on {object_set} objects", _command(run, str(run.path), object_set, episodes)))
         lacking += [
             (f"{name} on {object_set} objects", _command(run, name, object_set, episodes))
@@ -108,7 +108,8 @@ def _command(run: RunRecord, policy: str, object_set: str, episodes: int) -> str
 def _row(run: RunRecord, document: dict[str, Any], of_this_run: Sequence[dict[str, Any]]) -> Markup:
     low, high = document["success_ci95"]
     own = is_of_run(run, document)
-    name = element("strong", f"this run ({document['policy']})") if own else document["policy"]
+    name = policy_name(document)
+    name = element("strong", name.replace(document["policy"], f"this run ({document['policy']})")) if own else name
     cells = [
         document["object_set"],
         document["camera"],
@@ -117,7 +118,7 @@ def _row(run: RunRecord, document: dict[str, Any], of_this_run: Sequence[dict[st
         f"{percent(low)} to {percent(high)}",
         interval_mark(document["success_rate"], low, high),
         _motions(document),
-        "" if own else _paired(of_this_run, document),
+        "" if own and not document.get("planning") else _paired(of_this_run, document),
     ]
     return element(
         "tr", element("th", name, scope="row"), *(element("td", cell) for cell in cells), class_="own" if own else None
@@ -142,8 +143,8 @@ def _paired(of_this_run: Sequence[dict[str, Any]], other: dict[str, Any]) -> str
     return "not on the same scenes" if of_this_run else ""
 
 
-def _rank(run: RunRecord, document: dict[str, Any]) -> tuple[int, str]:
+def _rank(run: RunRecord, document: dict[str, Any]) -> tuple[int, bool, str]:
     if is_of_run(run, document):
-        return 0, document["camera"]
+        return 0, bool(document.get("planning")), document["camera"]
     policy = document["policy"]
-    return (1 + BASELINES.index(policy), policy) if policy in BASELINES else (1 + len(BASELINES), policy)
+    return (1 + BASELINES.index(policy) if policy in BASELINES else 1 + len(BASELINES)), False, policy
