@@ -1,5 +1,8 @@
 """A search that decides: what it reads, what it proposes, how it ranks, and what an evaluation says of it."""
 
+# Host arrays stand for device arrays here, and every shape is known.
+# pyright: reportArgumentType=false, reportOptionalMemberAccess=false
+
 import dataclasses
 import math
 from types import SimpleNamespace
@@ -129,7 +132,7 @@ class World:
 def decide(world: World, candidates: list[int], deadline: float = math.inf, **settings: int) -> int:
     config = PlanningConfig(**{"variants": 2, "depth": 1} | settings)
     roots = np.arange(1, config.variants + 1)
-    found = search(world, None, roots, candidates, config, deadline)  # pyright: ignore[reportArgumentType]
+    found = search(world, None, roots, candidates, config, deadline)
     assert found.pushes == world.pushes
     return found.action
 
@@ -194,7 +197,7 @@ def test_hidden_state_cannot_leak():
     config = dataclasses.replace(policy.config, scene=SceneConfig(test_scenes=2))
     env = make_env(config, split="test", threads=1)
     q_function = make_q_function(config.network, policy.config.task, env.primitive.actions)
-    blind = dataclasses.replace(env, bank=None, scenes=None, engine=None, eligible=None)  # pyright: ignore[reportArgumentType]
+    blind = dataclasses.replace(env, bank=None, scenes=None, engine=None, eligible=None)
     planner = Planner(blind, q_function, policy.params, PlanningConfig(depth=0, variants=1), threads=1)
     states = jax.device_get(jax.jit(jax.vmap(env.reset_to))(jnp.arange(2)))
     rng = np.random.default_rng(0)

@@ -1,5 +1,8 @@
 """What a planner remembers: an object that the hand hides stays as large as it was, where the rest of it is."""
 
+# Host arrays stand for device arrays here, and every shape is known.
+# pyright: reportArgumentType=false, reportOptionalMemberAccess=false
+
 import numpy as np
 import pytest
 

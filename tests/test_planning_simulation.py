@@ -1,5 +1,8 @@
 """Rebuilt objects in the slots: the written model against one compiled with the very same hulls."""
 
+# Host arrays stand for device arrays here, and every shape is known.
+# pyright: reportArgumentType=false, reportOptionalMemberAccess=false
+
 import jax
 import mujoco
 import numpy as np
@@ -44,6 +47,7 @@ def fall(simulations: native.Simulations, object_ids: np.ndarray) -> np.ndarray:
     nv = simulations.model.mj_model.nv
     state = jax.tree.map(lambda leaf: np.asarray(leaf)[None], engine.place(object_ids, np.float32(qpos), np.zeros(nv)))
     ctrl = np.tile(np.append(ROBOT.home[:6], 1.2).astype(np.float32), (1, 40, 1))
+    assert engine.advance is not None
     after = engine.advance(state, ctrl, np.array([40]))
     assert not after.diverged.any()
     return after.object_poses[0]
@@ -120,6 +124,7 @@ def test_finger_tips_stand_where_their_drivers_want_them(simulations: simulation
     state = engine.place(ids, qpos, np.zeros(model.nv))
     ctrl = np.tile(np.append(ROBOT.home[:6], 0.3).astype(np.float32), (1, 30, 1))
     batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], state)
+    assert engine.advance is not None
     after = engine.advance(batch, ctrl, np.array([30]))
     settled = np.asarray(engine.coordinates(jax.tree.map(lambda leaf: leaf[0], after))[0])
     num_robot = model.nq - 7 * MAX_OBJECTS

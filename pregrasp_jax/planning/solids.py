@@ -37,13 +37,13 @@ class Frustums(NamedTuple):
     present: np.ndarray
 
 
-def directions(angle: np.ndarray) -> np.ndarray:
+def directions(angle: np.ndarray | np.floating) -> np.ndarray:
     """Return unit vectors [..., NUM_SIDES, 2] for a turn [...] rad."""
     turned = np.asarray(angle)[..., None] + _ANGLES
     return np.stack([np.cos(turned), np.sin(turned)], axis=-1)
 
 
-def corners(support: np.ndarray, angle: np.ndarray) -> np.ndarray:
+def corners(support: np.ndarray, angle: np.ndarray | np.floating) -> np.ndarray:
     """Return the corners [..., NUM_SIDES, 2] m of polygons with tight `support`; k lies between sides k and k + 1."""
     following = np.roll(support, -1, axis=-1)
     step = 2 * np.pi / NUM_SIDES
