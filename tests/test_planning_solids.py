@@ -107,6 +107,14 @@ def test_layers_follow_a_bottle():
     np.testing.assert_allclose(found.support[:2].mean(axis=(1, 2)), [0.04, 0.015], atol=1.5e-3)
 
 
+def test_what_is_small_or_flat_is_an_object_still():
+    corner = grid.cell_to_world(np.array([50, 50, 51]), np.array([50, 51, 50]))
+    for count in (1, 2, 3):
+        found = outlines.stack(corner[:count], np.zeros(count))
+        assert found.present.sum() == 1 and found.height[0].tolist() == [0.0, 0.01]
+        assert (area(tighten(found.support[0])) > 1e-5).all()
+
+
 def test_a_handle_is_a_part_of_its_own():
     row, col = np.indices((grid.GRID_SIZE, grid.GRID_SIZE))
     xy = grid.cell_to_world(row.ravel(), col.ravel())

@@ -32,7 +32,7 @@ _MIN_CELLS = 3
 """Fewer cells have no outline."""
 
 _MIN_HEIGHT = 0.01
-"""m."""
+"""m; what is seen lower than this is taken to be as high."""
 
 _TURNS = np.linspace(0, 2 * np.pi / NUM_SIDES, 9)[:-1]
 _GAP = np.array([0.0, 1.0]) * _CELL
@@ -47,7 +47,7 @@ def stack(xy: np.ndarray, height: np.ndarray, *, edge: float = 0.0) -> Frustums:
         height: [N] m above the table.
         edge: m by which the camera sees objects too large on all sides.
     """
-    parts = _split(xy, height)
+    parts = _split(xy, np.maximum(height, _MIN_HEIGHT))
     budget = max(1, MAX_HULLS // len(parts))
     found = [layer for part in parts for layer in _layers(*part, edge, min(budget, _MAX_LAYERS))][:MAX_HULLS]
     absent = MAX_HULLS - len(found)
@@ -76,7 +76,7 @@ def turn_of(xy: np.ndarray) -> float:
 
 def _layers(xy: np.ndarray, height: np.ndarray, edge: float, most: int) -> list[tuple[np.ndarray, np.ndarray, float]]:
     """Return (support [2, NUM_SIDES], z [2], angle) of the layers of a part, from the table up."""
-    top = max(float(height.max()), _MIN_HEIGHT)
+    top = float(height.max())
     levels = np.linspace(0.0, top, _NUM_LEVELS + 1)
     middles = (levels[1:] + levels[:-1]) / 2
     counts = (height[None] >= middles[:, None]).sum(axis=1)
@@ -99,7 +99,7 @@ def _pieces(values: np.ndarray, most: int) -> list[tuple[int, int]]:
     count = len(values)
     cost = _misfit(values) / values.sum() + _LAYER_COST
     best, starts = [cost[0]], []
-    for _ in range(1, most):
+    for _ in range(1, min(most, count)):
         through = best[-1][:-1, None] + cost[1:]  # [i, last]: the last run starts after i
         starts.append(np.argmin(through, axis=0) + 1)
         best.append(through.min(axis=0))
