@@ -27,6 +27,9 @@ class AssetsConfig:
     """Folder of meshes, see docs/meshes.md (DIR/seen and DIR/unseen if present); None is the built-in catalogue."""
     object_set: ObjectSet = "seen"
     """Training uses `seen`; `unseen` holds objects kept for evaluation (Sec. IV-A)."""
+    variants: int = 0
+    """Objects made beside those of the set: scaled, drawn from families, cut and joined. Training meets them with the
+    set's own; validation and `evaluate` meet only others that were made in the same way. See docs/learning.md."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,6 +264,7 @@ class EvaluationConfig:
 
 _RANGES: dict[str, tuple[float, float]] = {
     "seed": (0, 2**32 - 1),
+    "assets.variants": (0, 10_000),
     "scene.min_objects": (2, 8),
     "scene.max_objects": (2, 8),
     "scene.train_scenes": (1, 100_000),

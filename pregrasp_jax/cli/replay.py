@@ -11,12 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax import drawing
-from pregrasp_jax.assets.sets import load_bank_for
 from pregrasp_jax.cli.outputs import refuse_unwritable
 from pregrasp_jax.report.play import describe_action, env_hulls, in_batch
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.startup import prepare
-from pregrasp_jax.task.env import Env, assemble
+from pregrasp_jax.task.env import Env, assemble, load_split_bank
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training.dump import Dump, load_dump
 from pregrasp_jax.training.mishap import Mishap
@@ -82,7 +81,7 @@ def make_replay_env(dump: Dump, engine: str, object_dir: str | None = None) -> E
     """
     config = dump.config
     assets = dataclasses.replace(config.assets, object_dir=object_dir or config.assets.object_dir)
-    bank = load_bank_for(assets.object_dir, assets.object_set)
+    bank = load_split_bank(dataclasses.replace(config, assets=assets), "train")
     if bank.content_hash != dump.hull_bank_hash:
         raise ValueError(
             f"{dump.path} is of other objects (hull bank {dump.hull_bank_hash}, {assets.object_dir or 'the built-in'} "

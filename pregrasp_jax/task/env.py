@@ -14,7 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax import geometry, heightmap, startup
+from pregrasp_jax.assets.bank import concatenate
 from pregrasp_jax.assets.sets import load_bank_for
+from pregrasp_jax.assets.variants import variant_bank
 from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.physics import make_engine
 from pregrasp_jax.physics.base import Engine
@@ -22,7 +24,7 @@ from pregrasp_jax.robot import get_robot
 from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.robot.clearance import CLEARANCE_MARGIN
 from pregrasp_jax.scene import bank as scene_bank
-from pregrasp_jax.scene.bank import SceneBank, Split
+from pregrasp_jax.scene.bank import SPLITS, SceneBank, Split
 from pregrasp_jax.scene.packing import MAX_RADIUS
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.workspace import Workspace, get_workspace
@@ -191,10 +193,27 @@ def make_env(
     threads = config.physics.threads if threads is None else threads
     refuse_walls(get_robot(config.task.robot), get_workspace(config.task.workspace))
     registry.get_kind(config.task.primitive)  # before anything is packed
-    bank = load_bank_for(config.assets.object_dir, config.assets.object_set)
+    bank = load_split_bank(config, split)
     eligible = eligible_targets(get_robot(config.task.robot), bank, origin=str(config.assets.object_dir or "built in"))
     scenes = scene_bank.load_or_build(bank, eligible, config.scene, split, threads=threads, progress=progress)
     return assemble(config, bank, scenes, eligible=eligible, threads=threads)
+
+
+def load_split_bank(config: Config, split: Split) -> HullBank:
+    """Return the objects of a split: those of the set, and with `assets.variants` what is made beside them.
+
+    Training meets both. Validation and test meet made objects only, others than training does, so that a run is judged
+    by shapes that it has not seen without looking at any set that is reported.
+
+    Raises:
+        ValueError: the objects cannot be used.
+    """
+    assets = config.assets
+    known = load_bank_for(assets.object_dir, assets.object_set)
+    if not assets.variants:
+        return known
+    made = variant_bank(known, assets.variants, seed=(config.scene.bank_seed, SPLITS.index(split)))
+    return concatenate([known, made]) if split == "train" else made
 
 
 def assemble(
