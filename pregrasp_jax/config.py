@@ -141,6 +141,8 @@ class LearnerConfig:
     """Transitions per update; with `mjx` on several devices a multiple of their number."""
     updates_per_step: float = 0.25
     """Updates per env step (a push of one scene); 16 scenes at 0.25 make 4 updates per parallel step."""
+    siblings: bool = False
+    """Learn from all pushes that were made from a state (`exploration.branches`) whenever one of them is sampled."""
     warmup: int = 500
     """Env steps of pure exploration before the first update."""
 

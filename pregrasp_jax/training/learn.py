@@ -64,6 +64,7 @@ def init_learning(
     optimizer: optax.GradientTransformation,
     *,
     max_pushes: int,
+    num_siblings: int = 1,
 ) -> Learning:
     """Return a learner without experience.
 
@@ -74,10 +75,12 @@ def init_learning(
         replay_config: capacity.
         optimizer: see `make_optimizer`.
         max_pushes: longest episode.
+        num_siblings: pushes from one state that are learned from together, see `replay.init`.
     """
+    memory = replay_lib.init(steps, capacity=replay_config.capacity, max_pushes=max_pushes, num_siblings=num_siblings)
     return Learning(
         learner=learner.init(params, optimizer),
-        replay=replay_lib.init(steps, capacity=replay_config.capacity, max_pushes=max_pushes),
+        replay=memory,
         key=key,
         updates=jnp.int32(0),
         metrics={name: jnp.float32(0) for name in METRICS},

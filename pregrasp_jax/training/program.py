@@ -175,6 +175,7 @@ def make_program(
             config.replay,
             optimizer,
             max_pushes=config.task.max_pushes,
+            num_siblings=1 + config.exploration.branches if config.learner.siblings else 1,
         )
         return TrainState(actors, learning)
 
