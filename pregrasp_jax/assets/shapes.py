@@ -67,7 +67,7 @@ def cut(part: np.ndarray, z: float, *, keep_above: bool) -> np.ndarray | None:
 def draw_scaled(rng: np.random.Generator, known: Sequence[Parts]) -> Parts:
     """Return a known object, scaled along each axis."""
     scale = [*rng.uniform(*SCALE_ACROSS, 2), rng.uniform(*SCALE_UP)]
-    return [part * scale for part in known[rng.integers(len(known))]]
+    return [part * scale for part in known[int(rng.integers(len(known)))]]
 
 
 def draw_can(rng: np.random.Generator, known: Sequence[Parts]) -> Parts:

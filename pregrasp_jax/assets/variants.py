@@ -4,20 +4,22 @@ Object i of a stream depends on the known objects, the seed and i alone, so a la
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import count
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from pregrasp_jax import io
-from pregrasp_jax.assets.bank import ConvexObject, load_bank, make_bank, save_bank
+from pregrasp_jax.assets.bank import ConvexObject, concatenate, load_bank, make_bank, save_bank
 from pregrasp_jax.assets.hulls import volume
 from pregrasp_jax.assets.measure import min_width
 from pregrasp_jax.assets.shapes import FAMILIES, HEIGHT, Parts
 from pregrasp_jax.messages import one_line
 from pregrasp_jax.types import MAX_HULLS, HullBank
+
+MakingProgress = Callable[[int, int], None]
+"""Called with objects made and objects wanted."""
 
 VERSION = 1
 """Of how objects are drawn: raise it when the same seed would give others."""
@@ -35,13 +37,16 @@ MIN_BASE, MAX_SLENDERNESS = 0.034, 4.2
 """m, narrowest width of the base; height per such width. The catalogue has 4.1."""
 
 
-def variant_bank(known: HullBank, number: int, *, seed: Sequence[int]) -> HullBank:
+def variant_bank(
+    known: HullBank, number: int, *, seed: Sequence[int], progress: MakingProgress | None = None
+) -> HullBank:
     """Return `number` objects made beside the `known` ones, from the cache if they were made before.
 
     Args:
         known: objects that some are scaled, cut and joined from.
-        number: how many.
+        number: how many; each takes a quarter of a second.
         seed: which ones; streams of different seeds share none.
+        progress: told about objects made so far, if any must be made.
     """
     digest = io.content_hash(known.content_hash, number, list(seed), VERSION)
     path = io.cache_dir() / "hulls" / f"variants-{digest}.npz"
@@ -51,14 +56,14 @@ def variant_bank(known: HullBank, number: int, *, seed: Sequence[int]) -> HullBa
         except ValueError as error:
             warnings.warn(f"{one_line(error)}; its objects are made anew", stacklevel=2)
     io.refuse_unwritable_cache(path)
-    bank = _build(known, number, seed)
-    save_bank(Path(path), bank)
+    parts, made = known_parts(known), []
+    for index in range(number):
+        made.append(make_bank([draw_variant(parts, index, seed=seed)]))
+        if progress:
+            progress(index + 1, number)
+    bank = concatenate(made)
+    save_bank(path, bank)
     return bank
-
-
-def _build(known: HullBank, number: int, seed: Sequence[int]) -> HullBank:
-    parts = known_parts(known)
-    return make_bank([draw_variant(parts, index, seed=seed) for index in range(number)])
 
 
 def known_parts(bank: HullBank) -> list[Parts]:

@@ -27,8 +27,8 @@ NUM_ENVS = 16
 LOOKAHEAD_NUM_ENVS = 4
 """The same for `lookahead`, each of whose decisions simulates `scripts.LOOKAHEAD_CANDIDATES` scenes."""
 
-_PACKING = 50
-"""Scenes between two lines that say how many are packed."""
+_PACKING, _MAKING = 50, 25
+"""Scenes, and objects, between two lines that say how many are packed or made."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,11 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
         if done == total or done % _PACKING < 16:
             say(f"packing test scenes: {done} of {total}")
 
-    env = make_env(config, split="test", progress=packed)
+    def made(done: int, total: int) -> None:
+        if done == total or done % _MAKING == 0:
+            say(f"making objects: {done} of {total}")
+
+    env = make_env(config, split="test", progress=packed, making=made)
     if trained is None:
         return Player(_make_script(request.policy, env, config), None, env, config)
     # Of the task that it was trained on: a window of another size is another input.

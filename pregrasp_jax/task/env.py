@@ -16,7 +16,7 @@ import numpy as np
 from pregrasp_jax import geometry, heightmap, startup
 from pregrasp_jax.assets.bank import concatenate
 from pregrasp_jax.assets.sets import load_bank_for
-from pregrasp_jax.assets.variants import variant_bank
+from pregrasp_jax.assets.variants import MakingProgress, variant_bank
 from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.physics import make_engine
 from pregrasp_jax.physics.base import Engine
@@ -176,7 +176,12 @@ class Env:
 
 
 def make_env(
-    config: Config, *, split: Split, threads: int | None = None, progress: scene_bank.PackingProgress | None = None
+    config: Config,
+    *,
+    split: Split,
+    threads: int | None = None,
+    progress: scene_bank.PackingProgress | None = None,
+    making: MakingProgress | None = None,
 ) -> Env:
     """Load the objects, load or pack the scenes of a split, and compile an engine of this environment's own.
 
@@ -185,6 +190,7 @@ def make_env(
         split: `train`, `validation` or `test`.
         threads: overrides `config.physics.threads`.
         progress: told about scenes packed so far, if any must be packed.
+        making: told about objects made so far, if any must be made.
 
     Raises:
         ValueError: the objects or settings cannot be used; one line says why.
@@ -193,17 +199,22 @@ def make_env(
     threads = config.physics.threads if threads is None else threads
     refuse_walls(get_robot(config.task.robot), get_workspace(config.task.workspace))
     registry.get_kind(config.task.primitive)  # before anything is packed
-    bank = load_split_bank(config, split)
+    bank = load_split_bank(config, split, making=making)
     eligible = eligible_targets(get_robot(config.task.robot), bank, origin=str(config.assets.object_dir or "built in"))
     scenes = scene_bank.load_or_build(bank, eligible, config.scene, split, threads=threads, progress=progress)
     return assemble(config, bank, scenes, eligible=eligible, threads=threads)
 
 
-def load_split_bank(config: Config, split: Split) -> HullBank:
+def load_split_bank(config: Config, split: Split, *, making: MakingProgress | None = None) -> HullBank:
     """Return the objects of a split: those of the set, and with `assets.variants` what is made beside them.
 
     Training meets both. Validation and test meet made objects only, others than training does, so that a run is judged
     by shapes that it has not seen without looking at any set that is reported.
+
+    Args:
+        config: the run's configuration.
+        split: `train`, `validation` or `test`.
+        making: told about objects made so far, if any must be made.
 
     Raises:
         ValueError: the objects cannot be used.
@@ -212,7 +223,7 @@ def load_split_bank(config: Config, split: Split) -> HullBank:
     known = load_bank_for(assets.object_dir, assets.object_set)
     if not assets.variants:
         return known
-    made = variant_bank(known, assets.variants, seed=(config.scene.bank_seed, SPLITS.index(split)))
+    made = variant_bank(known, assets.variants, seed=(config.scene.bank_seed, SPLITS.index(split)), progress=making)
     return concatenate([known, made]) if split == "train" else made
 
 

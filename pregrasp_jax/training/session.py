@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -156,11 +157,15 @@ def _create(run_dir: Path, config: Config) -> RunFolder:
 
 
 def _load(config: Config, split: Any, console: Console) -> Env:
-    def packed(done: int, total: int) -> None:
-        if done == total or done % max(1, total // 10) == 0:
-            console.say(f"packing {split} scenes: {done} of {total}")
+    def tell(doing: str) -> Callable[[int, int], None]:
+        def told(done: int, total: int) -> None:
+            if done == total or done % max(1, total // 10) == 0:
+                console.say(f"{doing}: {done} of {total}")
 
-    return make_env(config, split=split, progress=packed)
+        return told
+
+    packing, making = tell(f"packing {split} scenes"), tell(f"making objects for {split}")
+    return make_env(config, split=split, progress=packing, making=making)
 
 
 def _digest(config: Config, hashes: dict[str, str]) -> str:
