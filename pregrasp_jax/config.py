@@ -167,6 +167,8 @@ class ExplorationConfig:
     """More pushes simulated from every state, only to learn from: drawn like the real one, but softmax for greedy."""
     branch_temperature: float = 0.1
     """Temperature of that softmax, in units of Q."""
+    branch_spacing: float = 0.0
+    """m; greedy branches are the best pushes that end so far apart, as those of a search are; 0 draws by the softmax."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,6 +304,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "exploration.open_probability": (0.0, 1.0),
     "exploration.branches": (0, 64),
     "exploration.branch_temperature": (1e-3, 100.0),
+    "exploration.branch_spacing": (0.0, 0.5),
     "train.num_envs": (1, 65_536),
     "train.episodes": (1, 1_000_000_000),
     "train.minutes": (0.0, 1e6),

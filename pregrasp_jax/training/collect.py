@@ -191,6 +191,15 @@ def make_collect(
             open_probability=config.open_probability,
         )
 
+    def promising(key: jax.Array, q: jax.Array, mask: jax.Array) -> jax.Array:
+        """Return the greedy action and what its branches try instead, [1 + branches]."""
+        if config.branch_spacing:
+            count = 1 + config.branches
+            return exploration.best_apart(q, mask, q_function.actions, count=count, spacing=config.branch_spacing)
+        draw = functools.partial(exploration.softmax_action, temperature=config.branch_temperature)
+        drawn = jax.vmap(draw, (0, None, None))(jax.random.split(key, config.branches), q, mask)
+        return jnp.concatenate([greedy_action(q, mask)[None], drawn])
+
     def act(key: jax.Array, state: EnvState, q: jax.Array, epsilon: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return actions [1 + branches] of one scene, the real one first, and which of them are random."""
         mask = env.action_mask(state.hand)
@@ -198,10 +207,7 @@ def make_collect(
         explore_keys = jax.random.split(explore_key, 1 + config.branches)
         exploratory = jax.vmap(explore, (0, None, None))(explore_keys, state, mask)
         random = jax.random.uniform(choice_key, exploratory.shape) < epsilon
-        draw = functools.partial(exploration.softmax_action, temperature=config.branch_temperature)
-        drawn = jax.vmap(draw, (0, None, None))(jax.random.split(softmax_key, config.branches), q, mask)
-        promising = jnp.concatenate([greedy_action(q, mask)[None], drawn])
-        return jnp.where(random, exploratory, promising), random
+        return jnp.where(random, exploratory, promising(softmax_key, q, mask)), random
 
     def decide(actors: Actors, params: Params) -> tuple[Any, Plan, Any]:
         states = actors.env_states
