@@ -168,7 +168,7 @@ class ExplorationConfig:
     branch_temperature: float = 0.1
     """Temperature of that softmax, in units of Q."""
     branch_spacing: float = 0.0
-    """m; greedy branches are the best pushes that end so far apart, as those of a search are; 0 draws by the softmax."""
+    """m; greedy branches are the best pushes that end so far apart, as those of a search; 0 draws by the softmax."""
 
 
 @dataclass(frozen=True, kw_only=True)
