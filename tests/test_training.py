@@ -354,7 +354,7 @@ def test_the_learner_measures_what_the_report_prints(monkeypatch):
 
     def spy(*args: Any, **kwargs: Any) -> Any:
         result = original(*args, **kwargs)
-        measured.update(result[2])
+        measured.update(result[3])
         return result
 
     monkeypatch.setattr(learner, "update", spy)

@@ -11,6 +11,7 @@ from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.meshes import LoadedDir, load_object_dir
 from pregrasp_jax.assets.sets import format_table
+from pregrasp_jax.assets.variants import variant_bank
 from pregrasp_jax.cli import doctor as machine_doctor
 from pregrasp_jax.cli.outputs import refuse_unwritable
 from pregrasp_jax.config import (
@@ -29,7 +30,7 @@ from pregrasp_jax.evaluation.statistics import compare as compare_evaluations
 from pregrasp_jax.evaluation.statistics import format_comparison
 from pregrasp_jax.report.play import draw_decision, draw_scenes
 from pregrasp_jax.robot import get_robot
-from pregrasp_jax.scene.bank import SceneBank
+from pregrasp_jax.scene.bank import SPLITS, SceneBank
 from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import make_env
 from pregrasp_jax.types import HullBank
@@ -39,7 +40,12 @@ _SHOWN_SCENES = 12
 
 
 def assets(
-    object_dir: Path | None = None, /, *, object_set: ObjectSet | None = None, png: Path = Path("assets.png")
+    object_dir: Path | None = None,
+    /,
+    *,
+    object_set: ObjectSet | None = None,
+    variants: int = 0,
+    png: Path = Path("assets.png"),
 ) -> None:
     """List the objects of a mesh folder (or the built-in ones): hulls, size, mass, whether they can be targets.
 
@@ -47,14 +53,20 @@ def assets(
         object_dir: folder of .obj/.stl/.ply/.glb/.gltf/.off/.dae meshes, or of folders with one each, with
             subfolders seen and unseen or without; the built-in catalogue if left out.
         object_set: only this set; all that there are if left out.
+        variants: list instead so many objects made beside each set, as a training with `assets.variants` meets them.
         png: contact sheet of the objects, .png, .jpg, .jpeg or .webp; with two sets their names are added to that of
             the file.
     """
     refuse_unwritable(png, "image")
+    Config(assets=AssetsConfig(variants=variants)).validate()
     prepare()
     names: Sequence[ObjectSet] = (object_set,) if object_set else _object_sets(object_dir)
     for name in names:
         loaded = _load_objects(object_dir, name)
+        if variants:
+            loaded = LoadedDir(
+                variant_bank(loaded.bank, variants, seed=(SceneConfig().bank_seed, SPLITS.index("train")))
+            )
         eligible, why_not = get_robot(TaskConfig().robot).eligibility(loaded.bank)
         file = png if len(names) == 1 else png.with_stem(f"{png.stem}-{name}")
         print(f"{name} ({object_dir or 'built in'})\n{format_table(loaded, why_not)}")
