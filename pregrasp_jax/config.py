@@ -227,6 +227,13 @@ class Config:
                 f"scene.min_objects = {self.scene.min_objects} must not exceed scene.max_objects = "
                 f"{self.scene.max_objects}"
             )
+        if not self.exploration.branches:
+            for key in ("learner.siblings", "exploration.branch_spacing"):
+                if value := operator.attrgetter(key)(self):
+                    raise ValueError(
+                        f"{key} = {value} is about branches, and there are none; allowed is exploration.branches of "
+                        "1 or more with it"
+                    )
         return self
 
 

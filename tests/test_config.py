@@ -67,6 +67,11 @@ def test_what_is_wrong_is_named_with_what_is_allowed(values, said):
 def test_settings_that_contradict_each_other():
     with pytest.raises(ValueError, match=r"task.r_in = 0.3 must be below task.r_out = 0.2"):
         from_dict({"task": {"r_in": 0.3}}).validate()
+    with pytest.raises(ValueError, match=r"learner.siblings = True is about branches.* exploration.branches of 1"):
+        from_dict({"learner": {"siblings": True}}).validate()
+    with pytest.raises(ValueError, match=r"exploration.branch_spacing = 0.02 is about branches"):
+        from_dict({"exploration": {"branch_spacing": 0.02}}).validate()
+    from_dict({"learner": {"siblings": True}, "exploration": {"branches": 2, "branch_spacing": 0.02}}).validate()
     with pytest.raises(ValueError, match=r"scene.min_objects = 8 must not exceed scene.max_objects = 5"):
         from_dict({"scene": {"min_objects": 8, "max_objects": 5}}).validate()
 

@@ -195,7 +195,8 @@ def test_a_cell_is_drawn_among_those_that_the_choice_allows():
 
 def best_apart(q: np.ndarray, mask: np.ndarray, *, count: int, spacing: float) -> list[tuple[int, int, int]]:
     found = exploration.best_apart(jnp.asarray(q), jnp.asarray(mask), ACTIONS, count=count, spacing=spacing)
-    return [tuple(int(part) for part in ACTIONS.unravel(action)) for action in np.asarray(found)]
+    row, col, choice = ACTIONS.unravel(np.asarray(found))
+    return [(int(r), int(c), int(k)) for r, c, k in zip(row, col, choice, strict=True)]
 
 
 def test_the_best_pushes_apart_against_a_plain_loop():
