@@ -305,6 +305,11 @@ def test_assets_lists_and_draws_a_folder(run: Any, tmp_path: Path, monkeypatch: 
     assert "carton" in out and "refused: millimetres.stl" in out
     image = np.asarray(Image.open(png))
     assert image.ndim == 3 and image.std() > 5
+    code, out, err = run("assets", str(meshes), "--variants", "2", "--png", str(png))
+    assert code == 0, err
+    assert "made_0001" in out and "2 objects" in out and "millimetres" not in out
+    code, _, err = run("assets", "--variants", "-1", "--png", str(png))
+    assert code == 2 and "assets.variants = -1 is out of range; allowed is 0 to 10000" in err
 
 
 def test_describe_scenes_counts() -> None:
