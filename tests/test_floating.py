@@ -145,6 +145,9 @@ def test_refusals(robot):
     two = "<mujoco><worldbody><body name='a'/><body name='b'/></worldbody></mujoco>"
     with pytest.raises(ValueError, match="gripper holds 2 bodies; allowed is one"):
         make(two, ())
+    two_drives = GRIPPER.replace("</actuator>", '<position name="right" joint="right" kp="4"/></actuator>')
+    with pytest.raises(ValueError, match="actuators of hand gripper are left, right; allowed are right, left, in this"):
+        make(two_drives, ("right", "left"))
     ball = "<mujoco><worldbody><body name='a'><geom size='0.1'/></body></worldbody></mujoco>"
     with pytest.raises(ValueError, match="capsule or a box"):
         make(ball, ())

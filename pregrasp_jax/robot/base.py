@@ -63,6 +63,7 @@ class Robot:
         closing_region: (aperture () rad) -> `ClosingRegion`; None for a hand without one.
         eligibility: host; (hull bank) -> `Eligibility`.
         grasp_aperture: rad, commanded to close with constant force.
+        fingertips: names of the links that end the fingers; what nothing but them touches is pinched, not held.
     """
 
     name: str
@@ -79,6 +80,7 @@ class Robot:
     closing_region: Callable[[jax.Array], ClosingRegion] | None
     eligibility: Callable[[HullBank], Eligibility]
     grasp_aperture: float
+    fingertips: tuple[str, ...] = ()
 
     def joint_qpos_ids(self, mj_model: mujoco.MjModel) -> np.ndarray:
         """Return the addresses [J] in qpos of the joints."""

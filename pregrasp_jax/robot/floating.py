@@ -5,7 +5,7 @@ kinematics: its pose is its joint positions.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -45,8 +45,9 @@ def make_floating_hand(
     start: HandPose,
     closing_region: Callable[[jax.Array], ClosingRegion] | None,
     eligibility: Callable[[HullBank], Eligibility],
-    fingers: Sequence[str] = (),
+    fingers: Sequence[str] | Mapping[str, float] = (),
     grasp_aperture: float = 0.0,
+    fingertips: Sequence[str] = (),
 ) -> Robot:
     """Return a hand that goes wherever it is sent.
 
@@ -57,16 +58,25 @@ def make_floating_hand(
         start: where the hand is at the start of an episode, in host arrays (see `hand_pose_of`).
         closing_region: as in `Robot`.
         eligibility: as in `Robot`.
-        fingers: joints of the MJCF that stand at the aperture; each needs a position actuator of the same name. Others
-            must follow one of them by an equality.
+        fingers: joints of the MJCF that stand at the aperture, or at the share of it that a mapping gives; each needs a
+            position actuator of the same name. Others must follow one of them by an equality.
         grasp_aperture: as in `Robot`.
+        fingertips: bodies of the MJCF, see `Robot`.
 
     Raises:
         ValueError: the MJCF is not such a hand.
     """
     joints = (*JOINTS, *(PREFIX + finger for finger in fingers))
-    links = make_links(_carried(name, mjcf).compile(), joints)
-    home = np.array([*start.xy, start.z, start.yaw, *[start.aperture] * len(fingers)], np.float32)
+    mj_model = _carried(name, mjcf).compile()
+    links = make_links(mj_model, joints)
+    drives = tuple(mj_model.actuator(i).name for i in range(mj_model.nu))
+    if drives != joints:
+        had, wanted = (", ".join(x.removeprefix(PREFIX) for x in names[len(JOINTS) :]) for names in (drives, joints))
+        raise ValueError(
+            f"the actuators of hand {name} are {had or 'none'}; allowed are {wanted or 'none'}, in this order"
+        )
+    shares = np.array(list(fingers.values()) if isinstance(fingers, Mapping) else [1.0] * len(fingers), np.float32)
+    home = np.array([*start.xy, start.z, start.yaw, *(start.aperture * shares)], np.float32)
 
     def attach(spec: mujoco.MjSpec) -> None:
         spec.worldbody.add_frame().attach_body(_carried(name, mjcf).body(JOINTS[0]), "", "")
@@ -81,12 +91,13 @@ def make_floating_hand(
         attach=attach,
         set_home=functools.partial(_set_home, links=links, joints=joints, home=home),
         hand_pose=lambda joint_pos: jnp.append(joint_pos[:3], quat_from_yaw(joint_pos[3])),
-        follow=functools.partial(_follow, links, len(fingers)),
+        follow=functools.partial(_follow, links, shares),
         # The fingers may touch the table, so that only walls are kept clear of.
         clearance=lambda joint_pos, place: clearance.distance_to_walls(links, links.geoms, joint_pos, place),
         closing_region=closing_region,
         eligibility=eligibility,
         grasp_aperture=grasp_aperture,
+        fingertips=tuple(PREFIX + tip for tip in fingertips),
     )
 
 
@@ -121,13 +132,13 @@ def _carried(name: str, mjcf: str) -> mujoco.MjSpec:
 
 
 def _follow(
-    links: Links, num_fingers: int, joint_pos: jax.Array, poses: jax.Array, apertures: jax.Array, workspace: Workspace
+    links: Links, shares: np.ndarray, joint_pos: jax.Array, poses: jax.Array, apertures: jax.Array, workspace: Workspace
 ) -> tuple[jax.Array, jax.Array]:
     """Follow poses of the grasp point; see `Robot.follow`. Commands have velocity feed-forward."""
     yaw = jnp.unwrap(2 * jnp.arctan2(poses[:, 6], poses[:, 3]))
     turns = jnp.round((joint_pos[3] - yaw[0]) / (2 * jnp.pi))
     carrier = jnp.concatenate([poses[:, :3], (yaw + 2 * jnp.pi * turns)[:, None]], axis=1)
-    fingers = jnp.broadcast_to(apertures[:, None], (len(poses), num_fingers))
+    fingers = apertures[:, None] * shares[None]
     path = jnp.concatenate([carrier, fingers], axis=1)
     low, high = jnp.array(REACH).T
     height = jax.vmap(lambda q: clearance.height_above_table(links, links.geoms, q))(path)
