@@ -40,6 +40,9 @@ REASONS = (
     "obstacle_in_region",
     "no_action",
     "truncated",
+    "target_held",
+    "target_not_alone",
+    "obstacle_grasped",
 )
 """Why an episode ended; an integer reason indexes this tuple, earlier entries win."""
 
@@ -126,6 +129,25 @@ class SceneParams(struct.PyTreeNode):
     target: jax.Array
 
 
+class Touch(struct.PyTreeNode):
+    """What a hand touched in a stroke: down, ahead, close, up.
+
+    Attributes:
+        collided: () bool, it touched something on its way down, and went no farther.
+        rows: () int32 control rows that it moved; 0 before the first stroke.
+        poses: [3, MAX_OBJECTS, 7] float32 of the objects before it pushed, before it closed, and at the end, when what it
+            has lifted is still in the hand.
+        contacts: [L, MAX_OBJECTS] bool, which links of the robot touch which slots at the end.
+        gone: [MAX_OBJECTS] bool, which objects were taken away after it.
+    """
+
+    collided: jax.Array
+    rows: jax.Array
+    poses: jax.Array
+    contacts: jax.Array
+    gone: jax.Array
+
+
 class PhysicsObservation(struct.PyTreeNode):
     """What comes out of an engine.
 
@@ -135,6 +157,7 @@ class PhysicsObservation(struct.PyTreeNode):
         hand_pose: [7] float32 pose of the grasp point frame (x forward, z up) in the world.
         diverged: () bool, what the engine holds makes no sense (see `physics.base`): NaN, too fast, too deep, fallen.
         overflows: () int32 physics steps since the reset in which the engine had no room for every contact.
+        touch: what the hand touched in its last stroke, of engines that tell (`physics.strokes`).
     """
 
     object_poses: jax.Array
@@ -142,6 +165,7 @@ class PhysicsObservation(struct.PyTreeNode):
     hand_pose: jax.Array
     diverged: jax.Array
     overflows: jax.Array
+    touch: Touch | None = None
 
 
 class Observation(struct.PyTreeNode):

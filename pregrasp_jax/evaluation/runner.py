@@ -101,7 +101,8 @@ class Evaluator:
         self._program(self._start, indices)
         self._program(self._push, _bound(policy), runs, jax.random.key(0))
         self._program(self._restart, runs, indices)
-        self._program(self._grasp, enclosed.state)
+        if self._env.rules.asks_for_grasp:
+            self._program(self._grasp, enclosed.state)
 
     def run(
         self,
@@ -166,7 +167,7 @@ class Evaluator:
         yield Decision(run.state, None, episode.reason, episode.success)
 
     def _asks_for_grasp(self, run: _Run, with_grasp: bool) -> bool:
-        return with_grasp and int(run.reason) in self._env.rules.successes
+        return with_grasp and self._env.rules.asks_for_grasp and int(run.reason) in self._env.rules.successes
 
     def _run_to_ends(self, policy: Policy, episodes: int, key: jax.Array) -> Iterator[_Run]:
         """Yield every scene when its pushes have ended, as host arrays."""

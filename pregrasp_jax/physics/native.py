@@ -108,13 +108,8 @@ class Simulations:
             that of an object below the table is), in any physics step; not finite or too fast at the end.
         """
         with self._lock:
-            self.load(object_ids)
-            batch, num_scenes = self._batch, len(state)
-            # The state does not say which objects sleep, so all are woken: the result depends on nothing before.
-            batch.reset(np.arange(num_scenes))
-            batch.state[:num_scenes] = state
-            batch.warning[:num_scenes] = 0
-            fine = _interpolate(ctrl, self.num_substeps)
+            batch, num_scenes = self._begin(state, object_ids), len(state)
+            fine = interpolate(ctrl, self.num_substeps)
             failed, deep = np.zeros((2, num_scenes), bool)
             start = 0
             for stop in np.unique(num_ctrl[num_ctrl > 0]):
@@ -122,18 +117,37 @@ class Simulations:
                 if ids.size == 0:
                     break
                 rows = slice(start * self.num_substeps, stop * self.num_substeps)
-                nearest = np.zeros((len(ids), rows.stop - rows.start, 1))
-                out: dict[Any, np.ndarray] = {"sensordata": nearest}
-                try:
-                    batch.rollout(nearest.shape[1], fine[ids, rows], record=self._record, ids=ids, out=out)
-                except SimulationError as error:
-                    failed[error.ids] = True
-                deep[ids] |= nearest.min(axis=(1, 2)) < -MAX_PENETRATION
+                sensed, errors = self._roll(ids, fine[ids, rows])
+                failed[errors] = True
+                deep[ids] |= sensed[..., 0].min(axis=1) < -MAX_PENETRATION
                 failed |= batch.warning[:num_scenes].any(axis=(1, 2))
                 start = stop
             new_state = batch.state[:num_scenes].copy()
             speed = np.abs(batch.bind("qvel")[:num_scenes]).max(axis=1)
         return new_state, failed | deep | ~(speed < MAX_SPEED) | ~np.isfinite(new_state).all(axis=1)
+
+    def _begin(self, state: np.ndarray, object_ids: np.ndarray) -> Batch:
+        """Put objects and states [E, nstate] into the first E simulations."""
+        self.load(object_ids)
+        scenes = np.arange(len(state))
+        # The state does not say which objects sleep, so all are woken: the result depends on nothing before.
+        self._batch.reset(scenes)
+        self._batch.state[scenes] = state
+        self._batch.warning[scenes] = 0
+        return self._batch
+
+    def _roll(self, ids: np.ndarray, ctrl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Step simulations [n] with controls [n, T, A]; return sensors [n, T, S] and the simulations that failed.
+
+        The first sensor is the deepest contact; a model without sensors gives zeros.
+        """
+        sensed = np.zeros((*ctrl.shape[:2], max(self.model.mj_model.nsensordata, 1)))
+        out: dict[Any, np.ndarray] = {"sensordata": sensed}
+        try:
+            self._batch.rollout(ctrl.shape[1], ctrl, record=self._record, ids=ids, out=out)
+        except SimulationError as error:
+            return sensed, error.ids
+        return sensed, ids[:0]
 
     def describe(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return object poses [E, MAX_OBJECTS, 7] and joint positions [E, J] float32 of states [E, nstate]."""
@@ -156,7 +170,7 @@ class Simulations:
         return state
 
 
-def _interpolate(ctrl: np.ndarray, num_substeps: int) -> np.ndarray:
+def interpolate(ctrl: np.ndarray, num_substeps: int) -> np.ndarray:
     """Return [E, T * num_substeps, nu] float64: the control of every physics step, linear between the rows."""
     ctrl = ctrl.astype(np.float64)
     following = np.concatenate([ctrl[:, 1:], ctrl[:, -1:]], axis=1)
@@ -165,11 +179,13 @@ def _interpolate(ctrl: np.ndarray, num_substeps: int) -> np.ndarray:
     return fine.reshape(len(ctrl), -1, ctrl.shape[-1])
 
 
-def _to_bits(state: np.ndarray) -> np.ndarray:
+def to_bits(state: np.ndarray) -> np.ndarray:
+    """Return states [..., nstate] float64 as pairs of uint32 [..., 2 * nstate]."""
     return np.ascontiguousarray(state).view(np.uint32)
 
 
-def _from_bits(bits: np.ndarray) -> np.ndarray:
+def from_bits(bits: np.ndarray) -> np.ndarray:
+    """Return the states of bits; inverse of `to_bits`."""
     return np.ascontiguousarray(bits).view(np.float64)
 
 
@@ -217,7 +233,12 @@ def make_engine(
         model: a slot model of other hulls or options for the same objects.
     """
     model = model or slot_model.make_slot_model(native_spec(robot, workspace), bank)
-    native = _Native(Simulations(model, robot, threads=threads), robot)
+    return engine_of(Simulations(model, robot, threads=threads), robot)
+
+
+def engine_of(simulations: Simulations, robot: Robot) -> Engine:
+    """Return the engine of simulations at hand."""
+    native = _Native(simulations, robot)
     return Engine(
         name="native",
         init=native.init,
@@ -236,7 +257,7 @@ class _Native:
     def __init__(self, simulations: Simulations, robot: Robot):
         self._simulations, self._robot = simulations, robot
         home = simulations.home_state()
-        self._home_bits = _to_bits(home)
+        self._home_bits = to_bits(home)
         self._home_joint_pos = simulations.describe(home[None])[1][0]
         model = simulations.model.mj_model
         # Where qpos and qvel lie among the numbers of a state.
@@ -282,9 +303,9 @@ class _Native:
         )
         ctrl = np.asarray(ctrl).reshape(-1, *np.shape(ctrl)[-2:])
         num_ctrl = np.where(was_diverged, 0, np.asarray(num_ctrl).reshape(-1))
-        new_state, diverged = self._simulations.run(_from_bits(bits), object_ids, ctrl, num_ctrl)
+        new_state, diverged = self._simulations.run(from_bits(bits), object_ids, ctrl, num_ctrl)
         leaves = (
-            _to_bits(new_state),
+            to_bits(new_state),
             object_ids.astype(np.int32),
             *self._simulations.describe(new_state),
             diverged | was_diverged,
@@ -297,7 +318,7 @@ class _Native:
 
     def coordinates(self, state: NativeState) -> tuple[jax.Array, jax.Array]:
         def read(bits: Any) -> tuple[np.ndarray, ...]:
-            found = self._simulations.coordinates(_from_bits(np.asarray(bits)))
+            found = self._simulations.coordinates(from_bits(np.asarray(bits)))
             return tuple(values.astype(np.float32) for values in found)
 
         shapes = tuple(jax.ShapeDtypeStruct((size,), jnp.float32) for size in self._sizes)

@@ -214,7 +214,8 @@ def assemble(
     eligible = eligible_targets(robot, bank) if eligible is None else eligible
     reach = longest_push(config)
     parts = make_task(config.task, robot, workspace, bank, max_distance=reach)
-    engine = make_engine(config.physics.engine, bank, robot, workspace, threads=threads)
+    engines = registry.get_kind(config.task.primitive).engines
+    engine = make_engine(config.physics.engine, bank, robot, workspace, threads=threads, engines=engines)
     return Env(config.task, workspace, robot, *parts, bank, eligible, scenes, engine, reach)
 
 

@@ -36,6 +36,7 @@ class Plan(struct.PyTreeNode):
         seconds: () float32 s, how long the motion takes; 0 if nothing may be executed.
         obstruction: () int32 index into `OBSTRUCTIONS`.
         hand: commanded end of the motion, executed or not.
+        stroke: what it was planned for, where rules ask for that.
     """
 
     ctrl: Any
@@ -43,6 +44,7 @@ class Plan(struct.PyTreeNode):
     seconds: jax.Array
     obstruction: jax.Array
     hand: HandPose
+    stroke: Stroke | None = None
 
     @property
     def reachable(self) -> jax.Array:
@@ -52,7 +54,7 @@ class Plan(struct.PyTreeNode):
     def unless(self, refused: jax.Array, obstruction: str) -> "Plan":
         """Return the plan, or one that executes nothing where `refused` () bool and nothing else was in the way."""
         code = jnp.where(self.reachable & refused, OBSTRUCTIONS.index(obstruction), self.obstruction)
-        return make_plan(self.ctrl, self.num_ctrl, self.seconds, code, self.hand)
+        return make_plan(self.ctrl, self.num_ctrl, self.seconds, code, self.hand).replace(stroke=self.stroke)
 
 
 def make_plan(ctrl: Any, num_ctrl: jax.Array, seconds: jax.Array, obstruction: jax.Array, hand: HandPose) -> Plan:
@@ -75,15 +77,19 @@ class Primitive:
         name: as in `TaskConfig.primitive`.
         actions: what an index means.
         mask: (hand) -> [H, W, K] bool, which actions are allowed next.
-        decode: (hand, action () int32) -> `Stroke`.
+        decode: (hand, action) -> `Stroke`; an action is () int32, a flat index, or whatever else the primitive takes.
         plan: (joint_pos [J], stroke) -> `Plan`.
+        normal: (action) -> the form in which actions are kept.
+        motions: motions that people count for one action.
     """
 
     name: str
     actions: ActionSpace
     mask: Callable[[HandPose], jax.Array]
-    decode: Callable[[HandPose, jax.Array], Stroke]
-    plan: Callable[[jax.Array, Stroke], Plan]
+    decode: Callable[[HandPose, Any], Stroke]
+    plan: Callable[[jax.Array, Any], Plan]
+    normal: Callable[[Any], Any] = lambda action: action
+    motions: int = 1
 
 
 def follow(

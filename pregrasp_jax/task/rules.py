@@ -60,12 +60,14 @@ class Rules:
         hindsight_goal: (outcome, goal, eligible [MAX_OBJECTS] bool) -> slot () int32 and found () bool: the object for
             which an episode that ends with this outcome was a success, if there is one.
         successes: reasons that count as success, indices into `REASONS`.
+        asks_for_grasp: whether a success has yet to be grasped, by `Env.grasp`.
     """
 
     measure: Callable[[EnvState, EnvState, Plan], Outcome]
     judge: Callable[[Outcome, jax.Array], Verdict]
     hindsight_goal: Callable[[Outcome, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
     successes: tuple[int, ...]
+    asks_for_grasp: bool = True
 
     def succeeded(self, reason: jax.Array) -> jax.Array:
         """Return [...] bool, which reasons [...] count as success."""
