@@ -135,8 +135,8 @@ class Touch(struct.PyTreeNode):
     Attributes:
         collided: () bool, it touched something on its way down, and went no farther.
         rows: () int32 control rows that it moved; 0 before the first stroke.
-        poses: [3, MAX_OBJECTS, 7] float32 of the objects before it pushed, before it closed, and at the end, when what it
-            has lifted is still in the hand.
+        poses: [3, MAX_OBJECTS, 7] float32 of the objects before it pushed, before it closed, and at the end, when what
+            it has lifted is still in the hand.
         contacts: [L, MAX_OBJECTS] bool, which links of the robot touch which slots at the end.
         gone: [MAX_OBJECTS] bool, which objects were taken away after it.
     """

@@ -1,8 +1,8 @@
 """Strokes of a hand that comes from above, on the `native` engine: down, ahead, close, up; what it holds is taken away.
 
-Beside what `native` does it stops a hand that touches something on its way down, tells what the hand touches in the end,
-removes objects, and puts the hand back. Above the table nothing is in a hand's way, so that only the stroke is simulated,
-not how the hand gets there and back.
+Beside what `native` does it stops a hand that touches something on its way down, tells what the hand touches in the
+end, removes objects, and puts the hand back. Above the table nothing is in a hand's way, so that only the stroke is
+simulated, not how the hand gets there and back.
 """
 
 from collections.abc import Callable

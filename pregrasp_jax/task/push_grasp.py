@@ -3,8 +3,8 @@
 An action is where the hand comes down, its heading and its aperture: a `PushGrasp`, or a flat index of Q[row, col,
 heading], whose aperture is the middle of the range. After every stroke the hand is at home and out of the picture.
 
-Source: Kiatos et al., "Learning Push-Grasping in Dense Clutter" (RA-L 2022), as its published code does it; the times are
-those of a faster hand (docs/baselines.md).
+Source: Kiatos et al., "Learning Push-Grasping in Dense Clutter" (RA-L 2022), as its published code does it; the times
+are those of a faster hand (docs/baselines.md).
 """
 
 import functools
@@ -205,8 +205,8 @@ def standing(state: EnvState) -> jax.Array:
 def make_rules(robot: Robot, workspace: Workspace, primitive: Primitive, bank: HullBank, task: TaskConfig) -> Rules:
     """Return the rules of the target-oriented protocol.
 
-    The target held stably, alone, is success; held with another object, off the table or fallen, it is lost. Obstacles may
-    leave in any way, but a stroke that is meant for the target must not end with one of them in the hand.
+    The target held stably, alone, is success; held with another object, off the table or fallen, it is lost. Obstacles
+    may leave in any way, but a stroke that is meant for the target must not end with one of them in the hand.
 
     Raises:
         ValueError: the robot has no fingertips, so that no grasp of it is stable.
@@ -258,7 +258,7 @@ def stable(touch: Touch, tips: np.ndarray) -> jax.Array:
 
 
 def end_reason(outcome: GraspOutcome, goal: jax.Array) -> jax.Array:
-    """Return why a stroke ends an episode with target `goal` () int32, index into `REASONS`; `RUNNING` if it does not."""
+    """Return why a stroke ends an episode with target `goal` () int32; `RUNNING` if it does not."""
     is_goal = jnp.arange(MAX_OBJECTS) == goal
     holds = {
         "nan": outcome.diverged,

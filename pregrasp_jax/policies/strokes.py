@@ -1,0 +1,105 @@
+"""Strokes drawn at random as PPG explores: from beside the clutter toward a point of its outline.
+
+Functions describe one scene (unbatched). They look at the height map only.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from pregrasp_jax.policies.scripts import Policy
+from pregrasp_jax.spaces import grid
+from pregrasp_jax.spaces.actions import ActionSpace
+from pregrasp_jax.task.env import Env
+from pregrasp_jax.task.push_grasp import APERTURE, DISTANCE, HEADINGS, HEIGHT, PushGrasp, push_grasp
+from pregrasp_jax.types import EnvState
+
+NEAREST, FARTHEST = 0.10, DISTANCE
+"""m between the start of a stroke and the nearest cell that is higher than the hand."""
+
+_CELLS = round(DISTANCE / grid.HEIGHTMAP_RESOLUTION)
+"""Cells that a stroke is long."""
+
+
+class IndexedStroke(NamedTuple):
+    """A stroke as networks name it.
+
+    Attributes:
+        index: () int32, flat index of Q[row, col, heading].
+        aperture: () float32 rad.
+    """
+
+    index: jax.Array
+    aperture: jax.Array
+
+
+def from_index(actions: ActionSpace, stroke: IndexedStroke) -> PushGrasp:
+    """Return the stroke that begins at the cell of an index, with its heading."""
+    xy, choice = actions.decode(stroke.index)
+    return push_grasp(xy, actions.held(choice)[1], stroke.aperture)
+
+
+def guided_stroke(key: jax.Array, height: jax.Array, actions: ActionSpace) -> IndexedStroke:
+    """Draw a stroke: start uniform in a band around what is higher than the hand, aimed at a random point of its outline.
+
+    The point lies in the square that a stroke reaches along its sides; the heading is rounded to one of the sixteen, the
+    aperture is uniform. Where nothing is high any stroke is drawn.
+
+    Args:
+        key: consumed.
+        height: [H, W] m.
+        actions: sixteen headings per cell.
+    """
+    start_key, aim_key, aperture_key = jax.random.split(key, 3)
+    tall = height > HEIGHT
+    distance = grid.HEIGHTMAP_RESOLUTION * jnp.sqrt(squared_distance(tall))
+    band = (distance > NEAREST) & (distance < FARTHEST)
+    row, col = _draw_cell(start_key, jnp.where(jnp.any(band), band, True))
+    rows, cols = jnp.indices(tall.shape)
+    near = (jnp.abs(rows - row) <= _CELLS) & (jnp.abs(cols - col) <= _CELLS)
+    aims = outline(tall) & near
+    aim_row, aim_col = _draw_cell(aim_key, jnp.where(jnp.any(aims), aims, near))
+    yaw = jnp.arctan2((aim_row - row).astype(jnp.float32), (aim_col - col).astype(jnp.float32))
+    heading = jnp.mod(jnp.round(yaw / (2 * jnp.pi / HEADINGS)).astype(jnp.int32), HEADINGS)
+    aperture = jax.random.uniform(aperture_key, minval=APERTURE.low, maxval=APERTURE.high)
+    return IndexedStroke(actions.encode(row, col, heading), aperture)
+
+
+def squared_distance(mask: jax.Array) -> jax.Array:
+    """Return the squared distance [H, W], in cells, from each cell to the nearest one of `mask` [H, W] bool.
+
+    Infinite for an empty mask. First along rows, then along columns.
+    """
+    height, width = mask.shape
+
+    def squares(size: int) -> jax.Array:
+        steps = jnp.arange(size, dtype=jnp.float32)
+        return (steps[:, None] - steps[None]) ** 2
+
+    along_row = jnp.min(jnp.where(mask[:, None, :], squares(width)[None], jnp.inf), axis=-1)
+    return jnp.min(along_row[None] + squares(height)[..., None], axis=1)
+
+
+def outline(mask: jax.Array) -> jax.Array:
+    """Return the cells [H, W] bool of a mask that have a neighbour outside of it."""
+    padded = jnp.pad(mask, 1)
+    inner = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
+    return mask & ~inner
+
+
+def make_strokes(env: Env) -> Policy:
+    """Return the policy of random guided strokes, which knows no target."""
+    actions = env.primitive.actions
+
+    def act(state: EnvState, key: jax.Array) -> PushGrasp:
+        return from_index(actions, guided_stroke(key, grid.dequantize_height(state.obs.height), actions))
+
+    return act  # pyright: ignore[reportReturnType]
+
+
+def _draw_cell(key: jax.Array, allowed: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Draw row and column uniformly among the cells [H, W] bool that are allowed."""
+    flat = jax.random.categorical(key, jnp.where(allowed, 0.0, -jnp.inf).ravel())
+    row, col = jnp.divmod(flat, allowed.shape[1])
+    return row.astype(jnp.int32), col.astype(jnp.int32)
