@@ -17,6 +17,9 @@ EngineName = Literal["native", "mjx"]
 CameraName = Literal["orthographic", "pinhole"]
 Architecture = Literal["paper", "compact"]
 ObjectSet = Literal["seen", "unseen"]
+Method = Literal["q_learning", "imitation"]
+FreeSpace = Literal["feasible", "cluster"]
+Normalization = Literal["none", "batch"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,8 +168,42 @@ class ExplorationConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class StrokesConfig:
+    """PPG: strokes learnt by imitation of random ones that ended in a stable grasp."""
+
+    positives: int = 10_000
+    """Stable grasps to collect before the training."""
+    attempts: int = 15
+    """Strokes in a scene before the next one; it also ends when at most one object is left."""
+    singulation: bool = False
+    """Learn only from grasps before which the push took the object 15 mm farther away from its neighbours."""
+    collection: str | None = None
+    """Run whose stable grasps are learnt from; null collects its own."""
+    width: float = 0.25
+    """Factor on all channel counts of the network; 1.0 has the 10 M parameters of the original."""
+    normalization: Normalization = "none"
+    """`batch` normalises as the original does, in training by the batch alone."""
+    epochs: int = 15
+    """Passes over the stable grasps."""
+    batch_size: int = 8
+    """Stable grasps per update."""
+    learning_rate: float = 3e-4
+    """Adam step size at the start; it falls to 0 along a half cosine."""
+    validation_share: float = 0.1
+    """Share of the stable grasps by whose loss the parameters are chosen that are kept."""
+    mask_radius: float = 0.0
+    """m; Target-PPG considers only strokes that begin so near to the target; 0 considers all."""
+    free_space: FreeSpace = "feasible"
+    """When Target-PPG reaches for the target: once a stroke can take it and nothing else, or (`cluster`) once nothing
+    stands within 10 mm of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """How long, how wide, how often."""
+
+    method: Method = "q_learning"
+    """`q_learning`: the paper's; `imitation`: PPG, see `strokes`."""
 
     num_envs: int = 16
     """Scenes stepped in parallel; with `mjx` on several devices a multiple of their number."""
@@ -201,6 +238,7 @@ class Config:
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
+    strokes: StrokesConfig = field(default_factory=StrokesConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
     def validate(self) -> "Config":
@@ -296,6 +334,14 @@ _RANGES: dict[str, tuple[float, float]] = {
     "exploration.open_probability": (0.0, 1.0),
     "exploration.branches": (0, 64),
     "exploration.branch_temperature": (1e-3, 100.0),
+    "strokes.positives": (2, 10_000_000),
+    "strokes.attempts": (1, 1000),
+    "strokes.width": (1 / 32, 4.0),
+    "strokes.epochs": (1, 100_000),
+    "strokes.batch_size": (1, 4096),
+    "strokes.learning_rate": (1e-7, 1.0),
+    "strokes.validation_share": (0.0, 0.9),
+    "strokes.mask_radius": (0.0, 1.0),
     "train.num_envs": (1, 65_536),
     "train.episodes": (1, 1_000_000_000),
     "train.minutes": (0.0, 1e6),
@@ -340,9 +386,14 @@ PRESETS: dict[str, Config] = {
     ),
     "cpu": _CPU,
     "paper": Config(),
+    "ppg": Config(
+        task=TaskConfig(robot="barrett", primitive="push_grasp"),
+        strokes=StrokesConfig(positives=5_000),
+        train=TrainConfig(method="imitation"),
+    ),
 }
 """`ci`: 2 scenes, a minute, for tests. `demo`: minutes, shows every part. `cpu`: two cores, 150 minutes.
-`paper`: width 1.0, 45 K episodes, as published."""
+`paper`: width 1.0, 45 K episodes, as published. `ppg`: a baseline of the paper, another hand and method."""
 
 
 def to_dict(config: Any) -> dict[str, Any]:

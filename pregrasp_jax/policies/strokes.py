@@ -3,8 +3,7 @@
 Functions describe one scene (unbatched). They look at the height map only.
 """
 
-from typing import NamedTuple
-
+import flax.struct as struct
 import jax
 import jax.numpy as jnp
 
@@ -22,7 +21,7 @@ _CELLS = round(DISTANCE / grid.HEIGHTMAP_RESOLUTION)
 """Cells that a stroke is long."""
 
 
-class IndexedStroke(NamedTuple):
+class IndexedStroke(struct.PyTreeNode):
     """A stroke as networks name it.
 
     Attributes:
@@ -41,10 +40,10 @@ def from_index(actions: ActionSpace, stroke: IndexedStroke) -> PushGrasp:
 
 
 def guided_stroke(key: jax.Array, height: jax.Array, actions: ActionSpace) -> IndexedStroke:
-    """Draw a stroke: start uniform in a band around what is higher than the hand, aimed at a random point of its outline.
+    """Draw a stroke that starts in a band around what is higher than the hand, aimed at a point of its outline.
 
-    The point lies in the square that a stroke reaches along its sides; the heading is rounded to one of the sixteen, the
-    aperture is uniform. Where nothing is high any stroke is drawn.
+    Both are uniform. The point lies in the square that a stroke reaches along its sides; the heading is rounded to one
+    of the sixteen, the aperture is uniform. Where nothing is high any stroke is drawn.
 
     Args:
         key: consumed.

@@ -15,7 +15,7 @@ from pregrasp_jax.learning.q_function import Params, make_q_function
 from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import Env, make_env
-from pregrasp_jax.training import processes, resources, trainer
+from pregrasp_jax.training import imitation, processes, resources, trainer
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.dump import DumpFn, make_dump
 from pregrasp_jax.training.event_log import require_module
@@ -70,13 +70,21 @@ def resume(config: Config, run_dir: Path, *, console: Console | None = None) -> 
 
 
 def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
-    config.validate()
+    return METHODS[config.train.method](config.validate(), run_dir, folder, params, console)
+
+
+def _learn_q(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
     if config.train.tensorboard:
         require_module()
     layout = make_layout(config)
     if jax.device_count() > 1:
         console.say(f"training on {layout.num_devices} of {jax.device_count()} devices")
     env = _load(config, "train", console)
+    if not env.rules.asks_for_grasp:
+        raise ValueError(
+            f"train.method = q_learning learns where to push before a grasp, but task.primitive = "
+            f"{config.task.primitive!r} grasps by itself; allowed with it: imitation"
+        )
     validation = _load(config, "validation", console)
     program = make_program(env, config, params=params, layout=layout)
     resources.check(*program.shapes().split(), run_dir)
@@ -144,6 +152,29 @@ def make_evaluate(env: Env, config: Config) -> tuple[EvaluateFn, CompileFn]:
         evaluator.compile(make_policy(params), episodes=episodes)
 
     return evaluate, compile_evaluation
+
+
+def _imitate(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
+    if params is not None:
+        raise ValueError("--init-from is not known to train.method = imitation; allowed is to leave it out")
+    resumed = folder is not None
+    env = imitation.for_collecting(_load(config, "train", console))
+    folder = folder or _create(run_dir, config)
+    hashes = {"hull bank": env.bank.content_hash, "training scenes": env.scenes.content_hash}
+    with folder, Interrupt(console.say, console.close) as interrupt:
+        folder.begin_session(config, hashes)
+        try:
+            ending = imitation.run(
+                config, env, folder, console, resumed=resumed, stop=lambda: interrupt.exit_code is not None
+            )
+        finally:
+            console.close()
+        console.say(ending)
+        return interrupt.exit_code or 0
+
+
+METHODS = {"q_learning": _learn_q, "imitation": _imitate}
+"""Sessions by the name that `train.method` knows them by."""
 
 
 def _console() -> Console:
