@@ -26,8 +26,16 @@ FORMAT = "pregrasp_jax policy 2"
 _FORMAT_1 = "pregrasp_jax policy 1"
 """Of earlier runs; its checksum covers the parameters alone."""
 
-PRETRAINED = Path(__file__).parent.parent / "pretrained"
-"""The policy that ships with the package."""
+PPG = "ppg"
+"""Name of the policy of strokes that ships with the package."""
+
+_PACKAGE = Path(__file__).parent.parent
+
+SHIPPED = {"pretrained": _PACKAGE / "pretrained", PPG: _PACKAGE / "pretrained_ppg"}
+"""Folders of the policies that ship with the package."""
+
+PRETRAINED = SHIPPED["pretrained"]
+"""The one of the paper's method."""
 
 _PARAMS = "params.safetensors"
 _ALLOWED = f"pretrained, a run folder, or a folder with the {_PARAMS} that it wrote"
@@ -63,12 +71,12 @@ def save_policy(folder: Path, params: Any, config: Config, evaluation: dict[str,
 def load_policy(path: Path | str) -> TrainedPolicy:
     """Read a policy from a run folder (its best policy, else its latest checkpoint), a policy folder, or a file.
 
-    The name `pretrained` is that of the policy that ships with the package.
+    The names in `SHIPPED` are those of policies that ship with the package.
 
     Raises:
         ValueError: nothing there, damaged, or not written by `save_policy`; one line says which.
     """
-    path = PRETRAINED if str(path) == "pretrained" else Path(path)
+    path = SHIPPED.get(str(path), Path(path))
     for candidate in (path, path / _PARAMS, path / "best" / _PARAMS):
         if candidate.is_file():
             try:

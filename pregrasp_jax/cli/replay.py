@@ -13,7 +13,7 @@ import numpy as np
 from pregrasp_jax import drawing
 from pregrasp_jax.assets.sets import load_bank_for
 from pregrasp_jax.cli.outputs import refuse_unwritable
-from pregrasp_jax.report.play import describe_action, env_hulls, in_batch
+from pregrasp_jax.report.play import describe_action, env_hulls, in_batch, taken_action
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import Env, assemble
@@ -123,7 +123,7 @@ def describe_replay(env: Env, dump: Dump, mishap: Mishap, replay: RepeatedPush) 
     kind = f"branch {int(mishap.branch)}" if mishap.branch else "the real one"
     ended = "diverged" if replay.result.outcome.diverged else "did not diverge"
     lines = {
-        "push": f"{describe_action(env, int(mishap.action))} in {replay.duration:.2f} s; number "
+        "push": f"{describe_action(env, mishap.state.hand, mishap.action)} in {replay.duration:.2f} s; number "
         f"{int(mishap.state.num_pushes) + 1} of its episode, {kind}",
         "training": f"scene {int(mishap.scene)} at step {int(mishap.env_steps)} on {dump.engine}",
         "reason": f"{REASONS[int(replay.result.reason)]}; the physics {ended}",
@@ -143,7 +143,7 @@ def draw_replay(env: Env, mishap: Mishap, replay: RepeatedPush) -> np.ndarray:
         target,
         actions=env.primitive.actions,
         mask=np.asarray(env.action_mask(before.hand)),
-        action=int(mishap.action),
+        taken=taken_action(env, before.hand, mishap.action),
     )
     seen = replay.after.physics_obs
     if all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(seen)):

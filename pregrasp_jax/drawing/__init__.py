@@ -16,13 +16,14 @@ from pregrasp_jax.drawing.shaded import (
     look_at,
     side_view,
 )
-from pregrasp_jax.drawing.sheets import contact_sheet, make_panel, make_tiles
+from pregrasp_jax.drawing.sheets import Taken, contact_sheet, make_panel, make_tiles
 
 __all__ = [
     "OBSTACLE_COLORS",
     "ROBOT_COLOR",
     "TABLE_COLOR",
     "TARGET_COLOR",
+    "Taken",
     "contact_sheet",
     "draw_camera",
     "draw_heightmap",

@@ -34,7 +34,8 @@ class Episode:
         reason: why it ended: `target_in_region` (and grasped, if a grasp was asked for), `grasp_failed`, or
             another of `types.REASONS`.
         success: whether the episode counts as one.
-        motions: executed pushes; one that was refused as unreachable before the hand moved is not a motion.
+        motions: executed pushes, or strokes and retreats; what was refused before the hand moved is none.
+        attempts: executed actions; a stroke and its retreat are one.
         return_: sum of rewards, undiscounted.
         seconds: s, time the robot spent on its motions.
         overflows: physics steps in which the engine had no room for every contact.
@@ -48,6 +49,7 @@ class Episode:
     return_: float
     seconds: float
     overflows: int = 0
+    attempts: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """Return the row of the evaluation file."""
@@ -57,6 +59,7 @@ class Episode:
             "reason": self.reason,
             "success": self.success,
             "motions": self.motions,
+            "attempts": self.attempts,
             "return": round(self.return_, 4),
             "seconds": round(self.seconds, 4),
         }

@@ -38,14 +38,14 @@ class _Run(struct.PyTreeNode):
         reason: () int32, `RUNNING` until the episode ends.
         return_: () float32, rewards so far.
         seconds: () float32 s, time spent on motions so far.
-        action: () int32, the last one decided; -1 before the first.
+        action: the last one decided, in the normal form of the primitive; meaningless before the first.
     """
 
     state: EnvState
     reason: jax.Array
     return_: jax.Array
     seconds: jax.Array
-    action: jax.Array
+    action: Any
 
 
 class Decision(NamedTuple):
@@ -53,13 +53,13 @@ class Decision(NamedTuple):
 
     Attributes:
         state: unbatched, on the host.
-        action: the chosen push, None after the last one.
+        action: the chosen one in its normal form, a flat index or more, on the host; None after the last one.
         reason: why the episode has ended, as in `Episode.reason`; empty while it goes on.
         success: whether it has ended in one.
     """
 
     state: EnvState
-    action: int | None
+    action: Any
     reason: str = ""
     success: bool = False
 
@@ -162,7 +162,7 @@ class Evaluator:
         while run.reason == RUNNING:
             runs, before = self._call(self._push, policy, runs, key), run
             run = _first(runs)
-            yield Decision(before.state, int(run.action))
+            yield Decision(before.state, run.action)
         (episode,) = self._grasp_all([run]) if self._asks_for_grasp(run, with_grasp) else [self._episode(run)]
         yield Decision(run.state, None, episode.reason, episode.success)
 
@@ -225,14 +225,16 @@ class Evaluator:
             target=self._env.bank.names[int(scene.object_ids[scene.target])],
             reason=reason,
             success=success,
-            motions=int(run.state.num_pushes),
+            motions=int(run.state.num_pushes) * self._env.primitive.motions,
+            attempts=int(run.state.num_pushes),
             return_=float(run.return_),
             seconds=float(run.seconds),
             overflows=int(overflows),
         )
 
     def _start_one(self, index: jax.Array) -> _Run:
-        return _Run(self._env.reset_to(index), jnp.int32(RUNNING), jnp.float32(0.0), jnp.float32(0.0), jnp.int32(-1))
+        blank = self._env.primitive.normal(jnp.int32(-1))
+        return _Run(self._env.reset_to(index), jnp.int32(RUNNING), jnp.float32(0.0), jnp.float32(0.0), blank)
 
     def _restart_one(self, run: _Run, index: jax.Array) -> _Run:
         """Return scene `index` if it is not negative, else `run`."""
@@ -242,7 +244,7 @@ class Evaluator:
         """Let the policy decide, and plan; an ended run stays where it is."""
         state = run.state
         key = jax.random.fold_in(jax.random.fold_in(key, state.scene_index), state.num_pushes)
-        action = policy(state, key)
+        action = self._env.primitive.normal(policy(state, key))
         plan = self._env.plan(state, action).unless(run.reason != RUNNING, "no_ik")
         return state.physics, plan, run.replace(action=action)
 

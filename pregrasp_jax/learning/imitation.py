@@ -87,6 +87,12 @@ class StrokeFunction:
             "aperture": self.aperture.init(aperture_key, jnp.zeros((1, networks.WINDOW, networks.WINDOW)))["params"],
         }
 
+    def fits(self, params: Any) -> bool:
+        """Return whether parameters belong to these networks."""
+        expected = jax.eval_shape(self.init, jax.random.key(0))
+        shapes = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (params, expected)]
+        return shapes[0] == shapes[1]
+
     def values(self, params: Any, height: jax.Array) -> jax.Array:
         """Return the logits [H, W, K] of all starts and headings on a height map [H, W] m."""
         image = networks.padded(height)

@@ -7,12 +7,9 @@ import flax.struct as struct
 import jax
 import jax.numpy as jnp
 
-from pregrasp_jax.policies.scripts import Policy
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace
-from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.push_grasp import APERTURE, DISTANCE, HEADINGS, HEIGHT, PushGrasp, push_grasp
-from pregrasp_jax.types import EnvState
 
 NEAREST, FARTHEST = 0.10, DISTANCE
 """m between the start of a stroke and the nearest cell that is higher than the hand."""
@@ -85,16 +82,6 @@ def outline(mask: jax.Array) -> jax.Array:
     padded = jnp.pad(mask, 1)
     inner = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     return mask & ~inner
-
-
-def make_strokes(env: Env) -> Policy:
-    """Return the policy of random guided strokes, which knows no target."""
-    actions = env.primitive.actions
-
-    def act(state: EnvState, key: jax.Array) -> PushGrasp:
-        return from_index(actions, guided_stroke(key, grid.dequantize_height(state.obs.height), actions))
-
-    return act  # pyright: ignore[reportReturnType]
 
 
 def _draw_cell(key: jax.Array, allowed: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -50,6 +50,7 @@ def make_robot() -> Robot:
         eligibility=ur5e_rg2.eligibility,
         fingers=joints,
         grasp_aperture=CLOSED,
+        front=front,
         fingertips=[f"distal_{i}" for i in _FINGERS],
     )
 

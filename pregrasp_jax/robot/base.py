@@ -63,6 +63,8 @@ class Robot:
         closing_region: (aperture () rad) -> `ClosingRegion`; None for a hand without one.
         eligibility: host; (hull bank) -> `Eligibility`.
         grasp_aperture: rad, commanded to close with constant force.
+        front: (aperture () rad, y [...] m) -> [...] m, how far forward the open hand reaches on lines at y beside its
+            heading, -inf where it does not; None where nobody asks.
         fingertips: names of the links that end the fingers; what nothing but them touches is pinched, not held.
     """
 
@@ -80,6 +82,7 @@ class Robot:
     closing_region: Callable[[jax.Array], ClosingRegion] | None
     eligibility: Callable[[HullBank], Eligibility]
     grasp_aperture: float
+    front: Callable[[jax.Array, jax.Array], jax.Array] | None = None
     fingertips: tuple[str, ...] = ()
 
     def joint_qpos_ids(self, mj_model: mujoco.MjModel) -> np.ndarray:

@@ -47,6 +47,7 @@ def make_floating_hand(
     eligibility: Callable[[HullBank], Eligibility],
     fingers: Sequence[str] | Mapping[str, float] = (),
     grasp_aperture: float = 0.0,
+    front: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
     fingertips: Sequence[str] = (),
 ) -> Robot:
     """Return a hand that goes wherever it is sent.
@@ -61,6 +62,7 @@ def make_floating_hand(
         fingers: joints of the MJCF that stand at the aperture, or at the share of it that a mapping gives; each needs a
             position actuator of the same name. Others must follow one of them by an equality.
         grasp_aperture: as in `Robot`.
+        front: as in `Robot`.
         fingertips: bodies of the MJCF, see `Robot`.
 
     Raises:
@@ -97,6 +99,7 @@ def make_floating_hand(
         closing_region=closing_region,
         eligibility=eligibility,
         grasp_aperture=grasp_aperture,
+        front=front,
         fingertips=tuple(PREFIX + tip for tip in fingertips),
     )
 

@@ -81,6 +81,7 @@ class Primitive:
         plan: (joint_pos [J], stroke) -> `Plan`.
         normal: (action) -> the form in which actions are kept.
         motions: motions that people count for one action.
+        choice_of: (action in its normal form) -> which of the choices it is, () int32; None for flat indices.
     """
 
     name: str
@@ -90,6 +91,11 @@ class Primitive:
     plan: Callable[[jax.Array, Any], Plan]
     normal: Callable[[Any], Any] = lambda action: action
     motions: int = 1
+    choice_of: Callable[[Any], Any] | None = None
+
+    def choice(self, action: Any) -> Any:
+        """Return which of the choices () int32 an action is: whose Q map it is drawn on."""
+        return self.actions.unravel(action)[2] if self.choice_of is None else self.choice_of(action)
 
 
 def follow(

@@ -148,6 +148,7 @@ def make_push_grasp(
         plan=plan,
         normal=normal,
         motions=2,  # a stroke and the way back
+        choice_of=lambda stroke: jnp.round(stroke.start.yaw * HEADINGS / (2 * jnp.pi)).astype(jnp.int32) % HEADINGS,
     )
 
 

@@ -137,7 +137,7 @@ class _Session:
             params = self._init_params()
             self.state = {"scenes": self._begin_scenes(), "learner": self._learner(params), "best": params}
             if self.config.strokes.collection:
-                self.positives, self.counters.written = load_positives(Path(self.config.strokes.collection))
+                self.counters.written = copy_positives(Path(self.config.strokes.collection), self.positives)
             self.save()
             return
         template = jax.eval_shape(
@@ -310,15 +310,18 @@ def split(positives: Positives, written: int, config: Config) -> tuple[np.ndarra
     return rows[held_out:], rows[:held_out]
 
 
-def load_positives(run: Path) -> tuple[Positives, int]:
-    """Return the stable grasps that another run has collected, and how many there are.
+def copy_positives(run: Path, into: Positives) -> int:
+    """Copy the stable grasps that another run has collected, as many as there is room for; return how many.
 
     Raises:
         ValueError: it is no run of this kind, or has no intact checkpoint.
     """
     template = blank_positives(stored_config(run).strokes.positives)
     contents, written = read_ring(run / "checkpoints", template)
-    return jax.tree.map(np.array, contents), written
+    written = min(written, len(into.index))
+    for name in ("height", "index", "aperture", "gain"):
+        getattr(into, name)[:written] = np.asarray(getattr(contents, name))[:written]
+    return written
 
 
 def _listed(losses: dict[str, float]) -> str:
