@@ -264,7 +264,7 @@ class StepResult(struct.PyTreeNode):
     """What `env.step` returns beside the next state.
 
     Attributes:
-        outcome: what the push did, per object.
+        outcome: what the push did, per object: an `Outcome`, or what else the rules measure.
         reward: () float32 for the scene's own target.
         terminated: () bool, the episode ended by itself.
         truncated: () bool, it ran out of pushes.
@@ -272,7 +272,7 @@ class StepResult(struct.PyTreeNode):
         seconds: () float32 s, how long the robot took; 0 for a push that was not executed.
     """
 
-    outcome: Outcome
+    outcome: Any
     reward: jax.Array
     terminated: jax.Array
     truncated: jax.Array

@@ -100,7 +100,7 @@ class StrokeFunction:
         def look(headings: jax.Array) -> jax.Array:
             turned = jax.vmap(networks.turn, (None, 0))(image, headings)
             logits = self.start.apply({"params": params["start"]}, turned)
-            return networks.crop(jax.vmap(networks.turn_back)(logits, headings))
+            return networks.crop(jax.vmap(networks.turn_back)(jnp.asarray(logits), headings))
 
         maps = jax.lax.map(look, jnp.arange(HEADINGS).reshape(-1, _MOST_SCENES))
         return jnp.moveaxis(maps.reshape(HEADINGS, *height.shape), 0, -1)
@@ -152,7 +152,7 @@ def update(
 
     grads, (mean, moments) = jax.grad(objective, has_aux=True)(learner.params)
     updates, opt_state = optimizer.update(grads, learner.opt_state, learner.params)
-    params = optax.apply_updates(learner.params, updates)
+    params: Any = optax.apply_updates(learner.params, updates)
     params = {**params, "start": networks.with_moments(params["start"], moments)}
     return Learner(params, opt_state, learner.updates + 1), mean
 

@@ -206,8 +206,8 @@ class _Strokes:
         kept = jax.tree.map(lambda old, new: np.where(_like(going, new), new, old), state, result)
         return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), kept)
 
-    def _stroke(self, state: StrokeState, legs: Legs, going: np.ndarray) -> StrokeState:
-        """Return the states [E] after a stroke of the scenes that are `going` [E] bool."""
+    def _stroke(self, state: Any, legs: Any, going: np.ndarray) -> StrokeState:
+        """Return the states [E], host arrays as the arguments are, after a stroke of those `going` [E] bool."""
         simulations, (down, pushed) = self.simulations, legs.ends
         object_ids, ctrl = state.native.object_ids, legs.ctrl
         rows = from_bits(state.native.bits)
@@ -220,18 +220,15 @@ class _Strokes:
             rows, diverged = simulations.run(rows, object_ids, ctrl[:, leg], np.where(free, length, 0))
             failed |= diverged & free
             poses.append(simulations.describe(rows)[0])
-        contacts = simulations.contacts(len(rows)) & free[:, None, None]
         gone = self.gone(poses[-1]) & (object_ids >= 0)
-        return StrokeState(
-            native=self._tidy(rows, np.where(gone, -1, object_ids), failed),
-            touch=Touch(  # pyright: ignore[reportArgumentType]
-                collided=touched,
-                rows=np.where(free, ctrl.shape[1], num_rows).astype(np.int32),
-                poses=np.stack(poses, axis=1),
-                contacts=contacts,
-                gone=gone,
-            ),
-        )
+        touch: dict[str, Any] = {
+            "collided": touched,
+            "rows": np.where(free, ctrl.shape[1], num_rows).astype(np.int32),
+            "poses": np.stack(poses, axis=1),
+            "contacts": simulations.contacts(len(rows)) & free[:, None, None],
+            "gone": gone,
+        }
+        return StrokeState(self._tidy(rows, np.where(gone, -1, object_ids), failed), Touch(**touch))
 
     def _tidy(self, rows: np.ndarray, object_ids: np.ndarray, failed: np.ndarray) -> NativeState:
         """Return states [E] with the hand at home again and without the objects that are -1."""
@@ -244,13 +241,8 @@ class _Strokes:
         qpos[:, slots] = np.where(there, old_qpos[:, slots], qpos[:, slots])
         qvel[:, dofs] = np.where(there, old_qvel[:, dofs], 0.0)
         poses, joint_pos = simulations.describe(fresh)
-        return NativeState(  # pyright: ignore[reportArgumentType]
-            bits=to_bits(fresh),
-            object_ids=object_ids.astype(np.int32),
-            object_poses=poses,
-            joint_pos=joint_pos,
-            diverged=failed,
-        )
+        leaves: tuple[Any, ...] = (to_bits(fresh), object_ids.astype(np.int32), poses, joint_pos, failed)
+        return NativeState(*leaves)
 
 
 def _like(flags: np.ndarray, leaf: np.ndarray) -> np.ndarray:

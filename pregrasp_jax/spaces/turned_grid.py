@@ -59,7 +59,9 @@ def _read_from(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     y, x = np.meshgrid(line, line, indexing="ij")
     cos, sin = np.cos(angles)[:, None, None], np.sin(angles)[:, None, None]
     across = (SIZE - 1) / 2
-    return _rounded((sin * x + cos * y + 1) * across), _rounded((cos * x - sin * y + 1) * across)
+    # The original's rows are -y: where a cell lies between two, it takes the other one of them than rows along y would.
+    rows = SIZE - 1 - _rounded((1 - sin * x - cos * y) * across)
+    return rows, _rounded((cos * x - sin * y + 1) * across)
 
 
 def _rounded(values: np.ndarray) -> np.ndarray:

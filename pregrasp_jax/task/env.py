@@ -84,14 +84,13 @@ class Env:
         yaw, target = jnp.asarray(self.scenes.yaw)[index], jnp.asarray(self.scenes.target)[index]
         return self.start(self._scene(index, yaw, target), index)
 
-    def step(
-        self, state: EnvState, action: jax.Array, *, execute: jax.Array | bool = True
-    ) -> tuple[EnvState, StepResult]:
+    def step(self, state: EnvState, action: Any, *, execute: jax.Array | bool = True) -> tuple[EnvState, StepResult]:
         """Push, look, judge.
 
         Args:
             state: a running scene.
-            action: () int32 flat index of Q[row, col, choice]; it need not be allowed by `action_mask`.
+            action: () int32 flat index of Q[row, col, choice], or what else the primitive takes; it need not be allowed
+                by `action_mask`.
             execute: () bool; False refuses the push as if it were out of reach, which costs no physics. For searches
                 that are through with one scene of a batch.
 
@@ -101,7 +100,7 @@ class Env:
         plan = self.plan(state, action).unless(~jnp.asarray(execute), "no_ik")
         return self.conclude(state, plan, self.engine.run(state.physics, plan.ctrl, plan.num_ctrl))
 
-    def plan(self, state: EnvState, action: jax.Array) -> Plan:
+    def plan(self, state: EnvState, action: Any) -> Plan:
         """Return the motion of a push, reachable or not; see `step`."""
         return self.primitive.plan(state.physics_obs.joint_pos, self.primitive.decode(state.hand, action))
 

@@ -228,7 +228,8 @@ class _Session:
         for chunk in np.resize(rows, -(-len(rows) // size) * size).reshape(-1, size):
             batch = jax.tree.map(lambda leaf, chunk=chunk: leaf[chunk], self.positives)
             total += [float(np.mean(loss)) for loss in losses_of(params, batch)]
-        losses = dict(zip(("start", "aperture"), (total / -(-len(rows) // size)).tolist(), strict=True))
+        start, aperture = (total / -(-len(rows) // size)).tolist()
+        losses = {"start": start, "aperture": aperture}
         best = self.counters.best
         for name, loss in losses.items():
             if loss < best.get(name, np.inf):

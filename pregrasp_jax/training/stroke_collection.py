@@ -81,12 +81,13 @@ class Attempt(struct.PyTreeNode):
 
 def blank_positives(capacity: int) -> Positives:
     """Return host arrays with room for so many grasps."""
-    return Positives(  # pyright: ignore[reportArgumentType]
-        height=np.zeros((capacity, grid.GRID_SIZE, grid.GRID_SIZE), np.uint8),
-        index=np.zeros(capacity, np.int32),
-        aperture=np.zeros(capacity, np.float32),
-        gain=np.zeros(capacity, np.float32),
-    )
+    fields: dict[str, Any] = {
+        "height": np.zeros((capacity, grid.GRID_SIZE, grid.GRID_SIZE), np.uint8),
+        "index": np.zeros(capacity, np.int32),
+        "aperture": np.zeros(capacity, np.float32),
+        "gain": np.zeros(capacity, np.float32),
+    }
+    return Positives(**fields)
 
 
 def begin(env: Env, num_envs: int, key: jax.Array) -> Scenes:
@@ -122,7 +123,7 @@ def make_collect(env: Env, max_attempts: int) -> Stages:
             stroke=strokes,
             scene_ids=jnp.where(there, scenes.states.scene.object_ids, -1),
             result=results,
-            poses=states.physics_obs.touch.poses,
+            poses=states.physics.touch.poses,
         )
         attempts = scenes.attempts + 1
         left = jnp.sum(jax.vmap(standing)(states), axis=1)
