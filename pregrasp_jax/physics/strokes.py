@@ -210,7 +210,7 @@ class _Strokes:
         """Return the states [E], host arrays as the arguments are, after a stroke of those `going` [E] bool."""
         simulations, (down, pushed) = self.simulations, legs.ends
         object_ids, ctrl = state.native.object_ids, legs.ctrl
-        rows = from_bits(state.native.bits)
+        rows = from_bits(state.native.bits).copy()
         simulations.coordinates(rows)[0][:, simulations.joint_ids] = ctrl[:, 0]
         rows, touched, num_rows, failed = simulations.approach(rows, object_ids, ctrl[:, :down], going)
         free = going & ~touched & ~failed
