@@ -44,7 +44,10 @@ REASONS = (
     "target_not_alone",
     "obstacle_grasped",
 )
-"""Why an episode ended; an integer reason indexes this tuple, earlier entries win."""
+"""Why an episode ended; an integer reason indexes this tuple, earlier entries win. The last three are of strokes."""
+
+PUSH_REASONS = REASONS[: REASONS.index("truncated") + 1]
+"""Why episodes of pushes end: those that a training counts, and checkpoints hold the counts of."""
 
 OBSTRUCTIONS = ("none", "no_ik", "joint_limit", "table", "wall", "too_long", "end_error")
 """What keeps a hand from where it is sent: no joint solution, a joint's limit of angle or speed, an arm link too near

@@ -24,6 +24,8 @@ REASON_WORDS = {
     "no_action": "nowhere left to push",
     "truncated": "pushes used up",
     "grasp_failed": "grasp failed",
+    "target_not_alone": "target held, but not alone",
+    "obstacle_grasped": "obstacle grasped",
 }
 """Reasons for people; they are explained at `judge` and `types.REASONS`."""
 

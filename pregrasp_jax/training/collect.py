@@ -24,7 +24,7 @@ from pregrasp_jax.task.rules import Rules
 from pregrasp_jax.task.stages import Stages, make_stages
 from pregrasp_jax.training.mishap import Mishap, no_mishap
 from pregrasp_jax.training.sharding import VmapFn
-from pregrasp_jax.types import REASONS, EnvState, HandPose, StepResult
+from pregrasp_jax.types import PUSH_REASONS, EnvState, HandPose, StepResult
 
 RECENT_EPISODES = 200
 """Episodes behind `train/success_rate`, or one per scene where there are more scenes."""
@@ -81,7 +81,7 @@ class Tally(struct.PyTreeNode):
         explored: () int32 of them were random.
         overflowed: () int32 pushes since the last report, branches included, in which the engine dropped contacts.
         diverged: () int32 pushes since the last report, branches included, after which the physics made no sense.
-        reasons: [len(REASONS)] int32 why episodes ended since the last report.
+        reasons: [len(PUSH_REASONS)] int32 why episodes ended since the last report.
     """
 
     env_steps: jax.Array
@@ -152,7 +152,7 @@ def init_actors(key: jax.Array, env: Environment, num_envs: int, *, vmap: VmapFn
         explored=jnp.int32(0),
         overflowed=jnp.int32(0),
         diverged=jnp.int32(0),
-        reasons=jnp.zeros(len(REASONS), jnp.int32),
+        reasons=jnp.zeros(len(PUSH_REASONS), jnp.int32),
     )
     states = vmap(env.reset)(jax.random.split(reset_key, num_envs))
     return Actors(states, key, tally, no_mishap(states))
@@ -316,5 +316,7 @@ def metrics(tally: Tally, successes: Sequence[int]) -> dict[str, Any]:
         "train/explored": float(counts.explored / counts.pushes) if counts.pushes else None,
         "physics/overflows": int(counts.overflowed),
         "physics/diverged": int(counts.diverged),
-        **{f"reasons/{name}": int(n) for name, n in zip(REASONS, counts.reasons, strict=True) if name != "running"},
+        **{
+            f"reasons/{name}": int(n) for name, n in zip(PUSH_REASONS, counts.reasons, strict=True) if name != "running"
+        },
     }

@@ -32,13 +32,9 @@ from pregrasp_jax.learning.imitation import (
 )
 from pregrasp_jax.machine import announced_compilation
 from pregrasp_jax.task.env import Env
-from pregrasp_jax.task.push_grasp import make_push_grasp
 from pregrasp_jax.training.console import Console, format_time
 from pregrasp_jax.training.run_folder import RunFolder
 from pregrasp_jax.training.stroke_collection import Positives, Scenes, begin, blank_positives, make_collect, make_keep
-
-HOLD_TIME = 1.0
-"""s of holding in PPG's own protocol."""
 
 SINGULATED = 0.015
 """m that a push must take an object away from its neighbours for the singulation condition."""
@@ -78,27 +74,12 @@ class Counters:
         return self.attempts + self.updates
 
 
-def for_collecting(env: Env) -> Env:
-    """Return an environment whose strokes hold as long as in PPG's own protocol.
-
-    Raises:
-        ValueError: its primitive has no free aperture, so that nothing is there to imitate.
-    """
-    if not env.primitive.actions.free:
-        raise ValueError(
-            f"train.method = imitation learns strokes and apertures, which task.primitive = {env.task.primitive!r} "
-            "does not have; allowed is push_grasp"
-        )
-    primitive = make_push_grasp(env.robot, env.workspace, env.task, max_distance=0.0, hold_time=HOLD_TIME)
-    return dataclasses.replace(env, primitive=primitive)
-
-
 def run(config: Config, env: Env, folder: RunFolder, console: Console, *, resumed: bool, stop: StopFn) -> str:
     """Collect and learn until done, or until `stop` says so.
 
     Args:
         config: the run.
-        env: from `for_collecting`.
+        env: from `clearing.own_protocol`.
         folder: of the run, locked.
         console: told about progress.
         resumed: go on from the newest checkpoint, if there is one.

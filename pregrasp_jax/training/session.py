@@ -11,6 +11,7 @@ from pregrasp_jax import io
 from pregrasp_jax.checkpoint.policy import load_policy
 from pregrasp_jax.config import Config, to_dict, with_absolute_paths
 from pregrasp_jax.evaluation import Evaluator
+from pregrasp_jax.evaluation.clearing import own_protocol
 from pregrasp_jax.learning.q_function import Params, make_q_function
 from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.startup import prepare
@@ -158,7 +159,7 @@ def _imitate(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
     if params is not None:
         raise ValueError("--init-from is not known to train.method = imitation; allowed is to leave it out")
     resumed = folder is not None
-    env = imitation.for_collecting(_load(config, "train", console))
+    env = own_protocol(_load(config, "train", console))
     folder = folder or _create(run_dir, config)
     hashes = {"hull bank": env.bank.content_hash, "training scenes": env.scenes.content_hash}
     with folder, Interrupt(console.say, console.close) as interrupt:
