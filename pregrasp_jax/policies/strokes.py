@@ -11,11 +11,8 @@ from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace
 from pregrasp_jax.task.push_grasp import APERTURE, DISTANCE, HEADINGS, HEIGHT, PushGrasp, push_grasp
 
-NEAREST, FARTHEST = 0.10, DISTANCE
-"""m between the start of a stroke and the nearest cell that is higher than the hand."""
-
-_CELLS = round(DISTANCE / grid.HEIGHTMAP_RESOLUTION)
-"""Cells that a stroke is long."""
+NEAREST, FARTHEST = (round(distance / grid.HEIGHTMAP_RESOLUTION) for distance in (0.10, DISTANCE))
+"""Cells between the start of a stroke and the nearest cell that is higher than the hand; the second is the length of a stroke."""
 
 
 class IndexedStroke(struct.PyTreeNode):
@@ -49,11 +46,11 @@ def guided_stroke(key: jax.Array, height: jax.Array, actions: ActionSpace) -> In
     """
     start_key, aim_key, aperture_key = jax.random.split(key, 3)
     tall = height > HEIGHT
-    distance = grid.HEIGHTMAP_RESOLUTION * jnp.sqrt(squared_distance(tall))
-    band = (distance > NEAREST) & (distance < FARTHEST)
+    distance = squared_distance(tall)
+    band = (distance > NEAREST**2) & (distance < FARTHEST**2)
     row, col = _draw_cell(start_key, jnp.where(jnp.any(band), band, True))
     rows, cols = jnp.indices(tall.shape)
-    near = (jnp.abs(rows - row) <= _CELLS) & (jnp.abs(cols - col) <= _CELLS)
+    near = (jnp.abs(rows - row) <= FARTHEST) & (jnp.abs(cols - col) <= FARTHEST)
     aims = outline(tall) & near
     aim_row, aim_col = _draw_cell(aim_key, jnp.where(jnp.any(aims), aims, near))
     yaw = jnp.arctan2((aim_row - row).astype(jnp.float32), (aim_col - col).astype(jnp.float32))
