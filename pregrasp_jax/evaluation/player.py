@@ -245,6 +245,11 @@ def _make_script(name: str, env: Env, config: Config) -> Policy:
                 "--task.robot barrett --task.primitive push_grasp"
             )
         return STROKE_SCRIPTS[name](env, config.strokes)
+    if env.primitive.actions.free and name != "random":
+        raise ValueError(
+            f"policy {name} pushes, which task.primitive = {env.task.primitive!r} does not; allowed: random, "
+            f"{', '.join(STROKE_SCRIPTS)}, or a trained policy of strokes"
+        )
     if name == "lookahead":
         env = with_task(make_env(config, split="test"), camera="orthographic")
     return scripts.SCRIPTS[name](env)

@@ -12,7 +12,7 @@ from pregrasp_jax.spaces.actions import ActionSpace
 from pregrasp_jax.task.push_grasp import APERTURE, DISTANCE, HEADINGS, HEIGHT, PushGrasp, push_grasp
 
 NEAREST, FARTHEST = (round(distance / grid.HEIGHTMAP_RESOLUTION) for distance in (0.10, DISTANCE))
-"""Cells between the start of a stroke and the nearest cell that is higher than the hand; the second is the length of a stroke."""
+"""Cells between the start of a stroke and the nearest cell that is higher than the hand; the second is its length."""
 
 
 class IndexedStroke(struct.PyTreeNode):
