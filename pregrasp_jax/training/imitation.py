@@ -104,30 +104,21 @@ class _Session:
 
     def __init__(self, config: Config, env: Env, folder: RunFolder, console: Console, stop: StopFn):
         self.config, self.env, self.folder, self.console, self.stop = config, env, folder, console, stop
-        self.key, scene_key, init_key = jax.random.split(jax.random.key(config.seed), 3)
+        self.key, self._scene_key, self._init_key = jax.random.split(jax.random.key(config.seed), 3)
         self.function = StrokeFunction(config.strokes, env.primitive.actions)
         self.counters = Counters()
         self.positives: Positives = blank_positives(config.strokes.positives)
-        self._begin_scenes = lambda: begin(env, config.train.num_envs, scene_key)
-        self._init_params = lambda: self.function.init(init_key)
         self._saved_at = time.monotonic()
 
     def start(self, *, resumed: bool) -> None:
         """Take up the newest checkpoint, or begin."""
         if not resumed:
-            params = self._init_params()
-            self.state = {"scenes": self._begin_scenes(), "learner": self._learner(params), "best": params}
+            self.state = self._first_state()
             if self.config.strokes.collection:
                 self.counters.written = copy_positives(Path(self.config.strokes.collection), self.positives)
             self.save()
             return
-        template = jax.eval_shape(
-            lambda: {
-                "scenes": self._begin_scenes(),
-                "learner": self._learner(self._init_params()),
-                "best": self._init_params(),
-            }
-        )
+        template = jax.eval_shape(self._first_state)
         restored = restore(self.folder.checkpoints, template, self.positives)
         for problem in restored.problems:
             self.console.say(f"warning: {problem}; going on from the checkpoint of step {restored.step}")
@@ -226,8 +217,13 @@ class _Session:
         actions = self.env.primitive.actions
         return jax.vmap(lambda h, i, a: demonstration(h, i, a, actions))(batch.height, batch.index, batch.aperture)
 
-    def _learner(self, params: Any) -> Learner:
-        return Learner(params, self._optimizer(1).init(params), jnp.int32(0))
+    def _first_state(self) -> dict[str, Any]:
+        """Return what a checkpoint holds beside the grasps: scenes under way, the learner, the best parameters."""
+        params = self.function.init(self._init_key)
+        learner = Learner(params, self._optimizer(1).init(params), jnp.int32(0))
+        strokes, num_envs = self.config.strokes, self.config.train.num_envs
+        scenes = None if strokes.collection else begin(self.env, num_envs, self._scene_key)
+        return {"scenes": scenes, "learner": learner, "best": params}
 
     def _optimizer(self, per_epoch: int) -> Any:
         return make_optimizer(self.config.strokes, self.config.strokes.epochs * per_epoch)
