@@ -11,6 +11,8 @@ from pregrasp_jax.assets.bank import select
 from pregrasp_jax.assets.sets import builtin_bank
 from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.physics import make_engine
+from pregrasp_jax.physics.base import MAX_PENETRATION
+from pregrasp_jax.physics.native import from_bits
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.spaces.workspace import TABLE
@@ -29,7 +31,7 @@ def robot():
 @pytest.fixture(scope="module")
 def bank():
     bank = builtin_bank("seen")
-    return select(bank, [bank.names.index("ycb_mustard_bottle")])
+    return select(bank, [bank.names.index(name) for name in ("ycb_mustard_bottle", "ycb_chips_can")])
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +98,24 @@ def test_a_hand_that_comes_down_on_an_object_stops_at_once(states):
     assert touch.collided and 20 < touch.rows < 50
     assert not touch.gone.any() and not touch.contacts.any()
     np.testing.assert_allclose(state.native.object_poses[0, :2], [-0.18, 0.0], atol=5e-3)
+
+
+def test_an_object_that_slips_from_a_lifted_hand_has_not_diverged(engine, robot, monkeypatch):
+    can = scene((0.0, 0.2)).replace(object_ids=scene((0.0, 0.2)).object_ids.at[0].set(1))
+    tilts = np.linspace(0.0, 0.5, 6)  # on an edge it sinks in deeper than on its base
+    poses = [jnp.array([0.0, 0.2, 0.29, np.cos(tilt), np.sin(tilt), 0.0, 0.0]) for tilt in tilts]
+    falling = [can.replace(poses=can.poses.at[0].set(pose)) for pose in poses]
+    states = [engine.reset(engine.init(), s).native for s in falling]
+    bits, ids = (np.stack([np.asarray(getattr(state, name)) for state in states]) for name in ("bits", "object_ids"))
+    ctrl = np.tile(robot.home, (len(tilts), 20, 1))
+    simulations = engine.advance.__self__.simulations
+
+    def diverged():
+        return simulations.run(from_bits(bits).copy(), ids, ctrl, np.full(len(tilts), 20))[1]
+
+    assert not diverged().any()
+    monkeypatch.setattr(simulations, "max_penetration", MAX_PENETRATION)
+    assert diverged().any(), "the limit of pushes, where nothing falls"
 
 
 def test_what_stands_beside_stays(states):

@@ -52,7 +52,12 @@ class Simulations:
     """A `Batch` that grows to the number of scenes it is asked for, with the objects loaded in each.
 
     Not for concurrent use by several owners: a lock serialises calls, and evaluation makes its own engine.
+
+    Attributes:
+        max_penetration: m, how deep a contact may be.
     """
+
+    max_penetration = MAX_PENETRATION
 
     def __init__(self, model: SlotModel, robot: Robot, *, threads: int = 0):
         slot_model.silence_warnings()
@@ -119,7 +124,7 @@ class Simulations:
                 rows = slice(start * self.num_substeps, stop * self.num_substeps)
                 sensed, errors = self._roll(ids, fine[ids, rows])
                 failed[errors] = True
-                deep[ids] |= sensed[..., 0].min(axis=1) < -MAX_PENETRATION
+                deep[ids] |= sensed[..., 0].min(axis=1) < -self.max_penetration
                 failed |= batch.warning[:num_scenes].any(axis=(1, 2))
                 start = stop
             new_state = batch.state[:num_scenes].copy()
