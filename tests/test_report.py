@@ -9,7 +9,7 @@ from report_files import ROWS, evaluation_row, run_main, write_evaluation, write
 from pregrasp_jax.config import PRESETS, to_dict
 from pregrasp_jax.report import build_page, load_evaluations, read_run
 from pregrasp_jax.report.charts import duration, failure_figures, learning_figures, time_figures
-from pregrasp_jax.report.results import BASELINES, missing
+from pregrasp_jax.report.results import SCRIPTS, missing
 
 
 @pytest.fixture
@@ -51,7 +51,9 @@ def test_files_named_on_the_command_line_replace_those_of_the_folder(run_dir: Pa
 
 def test_missing_evaluations_are_named_with_their_command(run_dir: Path) -> None:
     run = read_run(run_dir)
-    assert [what for what, _ in missing(run, [])] == [f"{who} on seen objects" for who in ("this run", *BASELINES)]
+    assert [what for what, _ in missing(run, [])] == [
+        f"{who} on seen objects" for who in ("this run", *SCRIPTS["q_learning"])
+    ]
     write_evaluation(run_dir / "evaluations" / "a.json", "clear", [1, 0] * 20)
     write_evaluation(run_dir / "evaluations" / "b.json", "first", [1, 0] * 20)
     lacking = dict(missing(run, load_evaluations(run)))

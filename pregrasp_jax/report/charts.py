@@ -45,7 +45,13 @@ def learning_figures(run: RunRecord) -> list[Markup]:
         "epsilon": run.curve("train/epsilon"),
         "random pushes, measured": run.curve("train/explored"),
     }
+    starts = {"learning": run.curve("train/start_loss"), "validation": run.curve("eval/start_loss")}
+    apertures = {"learning": run.curve("train/aperture_loss"), "validation": run.curve("eval/aperture_loss")}
+    strokes = "strokes, then updates"
     figures = [
+        _figure("Stable grasps", _lines({"kept": run.curve("collect/stable")}), x_label=strokes, y_label="grasps"),
+        _figure("Loss of starts", _lines(starts), x_label=strokes, y_label="cross-entropy"),
+        _figure("Loss of apertures", _lines(apertures), x_label=strokes, y_label="Huber loss"),
         _figure("Success against pushes", _success(run), x_label=_STEPS, **percent),
         _figure("Success against time", _success(run, **time), x_label=f"training time ({unit})", **percent),
         _figure("Loss", _lines({"loss per update": run.curve("train/loss")}), x_label=_STEPS, y_label="Huber loss"),

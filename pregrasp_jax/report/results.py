@@ -12,8 +12,14 @@ from pregrasp_jax.report.markup import Markup, element
 from pregrasp_jax.report.record import RunRecord
 from pregrasp_jax.report.svg import interval_mark
 
-BASELINES = ("random", "straight", "clear", "lookahead")
-"""Scripts that a run is compared with."""
+SCRIPTS = {
+    "q_learning": ("random", "straight", "clear", "lookahead"),
+    "imitation": ("strokes", "target-strokes"),
+}
+"""Scripts that a run is compared with, by its `train.method`."""
+
+BASELINES = tuple(name for names in SCRIPTS.values() for name in names)
+"""All of them."""
 
 EVALUATIONS = "evaluations"
 """Subfolder of a run in which evaluation files are looked for."""
@@ -82,7 +88,7 @@ def missing(run: RunRecord, documents: Sequence[dict[str, Any]]) -> list[tuple[s
             lacking.append((f"this run on {object_set} objects", _command(run, str(run.path), object_set, episodes)))
         lacking += [
             (f"{name} on {object_set} objects", _command(run, name, object_set, episodes))
-            for name in BASELINES
+            for name in SCRIPTS[run.setting("train", "method", "q_learning")]
             if name not in names
         ]
     return lacking
@@ -102,6 +108,9 @@ def _command(run: RunRecord, policy: str, object_set: str, episodes: int) -> str
     radius = run.setting("task", "r_out", Config().task.r_out)
     if policy in BASELINES and radius != TaskConfig().r_out:
         arguments += ["--r-out", str(radius)]
+    if policy in SCRIPTS["imitation"]:
+        for key in ("robot", "primitive"):
+            arguments += [f"--task.{key}", str(run.setting("task", key, getattr(TaskConfig(), key)))]
     return shlex.join(["pregrasp-jax", "evaluate", *arguments, "--json", str(run.path / EVALUATIONS / f"{name}.json")])
 
 
