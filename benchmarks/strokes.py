@@ -80,6 +80,8 @@ def main() -> None:
     if arguments.packed:
         print(json.dumps(packed(arguments.packed, arguments.threads)))
         return
+    for aperture in arguments.aperture:
+        push_grasp.APERTURE.refuse(aperture)
     bank, robot, task = builtin_bank(arguments.object_set), get_robot("barrett"), TaskConfig(primitive="push_grasp")
     engines = registry.get_kind(task.primitive).engines
     engine = make_engine("native", bank, robot, TABLE, threads=arguments.threads, engines=engines)

@@ -218,6 +218,21 @@ def _document(result: EvaluationResult = RESULT, policy: str = "clear") -> dict:
     )
 
 
+def test_an_attempt_may_be_two_motions_and_a_target_held_in_any_way() -> None:
+    """Strokes: two successes after 1 and 3 strokes with the way back, one target held with another object."""
+    kinds = {"motions_per_attempt": 2, "target": "can", "return_": 0.0, "seconds": 1.0}
+    episodes = [
+        Episode(scene=0, reason="target_held", success=True, motions=2, **kinds),
+        Episode(scene=1, reason="target_held", success=True, motions=6, **kinds),
+        Episode(scene=2, reason="target_not_alone", success=False, motions=4, **kinds),
+        Episode(scene=3, reason="truncated", success=False, motions=20, **kinds),
+    ]
+    summary = EvaluationResult(tuple(episodes)).summary()
+    assert (summary["mean_motions"], summary["mean_attempts"]) == (4.0, 2.0)
+    assert (summary["success_rate"], summary["lenient_rate"]) == (0.5, 0.75)
+    assert [episode.to_dict()["attempts"] for episode in episodes] == [1, 3, 2, 10]
+
+
 def test_summary_by_hand() -> None:
     document = _document()
     assert document["success_rate"] == 0.4
@@ -234,6 +249,7 @@ def test_summary_by_hand() -> None:
         "reason": "off_table",
         "success": False,
         "motions": 3,
+        "attempts": 3,
         "return": 2.0,
         "seconds": 1.0,
     }

@@ -218,6 +218,8 @@ def test_refusals(bank, robot):
         make_engine("native", bank, arm, TABLE, engines=KIND.engines)
     with pytest.raises(ValueError, match=r"physics\.engine = 'mjx' cannot do this task; allowed: native$"):
         make_engine("mjx", bank, robot, TABLE, engines=KIND.engines)
+    with pytest.raises(ValueError, match=r"aperture = 1\.3 rad is out of range; allowed is 0\.6 to 1\.1$"):
+        push_grasp.push_grasp(jnp.zeros(2), 0.0, 1.3)
     without = dataclasses.replace(robot, fingertips=())
     with pytest.raises(ValueError, match="robot barrett names no fingertips"):
         KIND.make_rules(without, TABLE, None, bank, TaskConfig())

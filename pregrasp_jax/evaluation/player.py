@@ -192,9 +192,10 @@ def _load(spec: str) -> Any:
     if spec in scripts.SCRIPTS or spec in STROKE_SCRIPTS:
         return None
     folder, _ = _named(spec)
-    if folder in SHIPPED or Path(folder).exists():
+    if SHIPPED.get(folder, Path(folder)).exists():
         return load_policy(folder)
-    names = ", ".join([*scripts.SCRIPTS, *STROKE_SCRIPTS, "pretrained", *SHIPPED_STYLES])
+    shipped = [name for name in ("pretrained", *SHIPPED_STYLES) if SHIPPED[_named(name)[0]].exists()]
+    names = ", ".join([*scripts.SCRIPTS, *STROKE_SCRIPTS, *shipped])
     raise ValueError(f"policy {spec} does not exist; allowed: {names}, or a run folder")
 
 

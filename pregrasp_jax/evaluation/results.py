@@ -39,7 +39,7 @@ class Episode:
             another of `types.REASONS`.
         success: whether the episode counts as one.
         motions: executed pushes, or strokes and retreats; what was refused before the hand moved is none.
-        attempts: executed actions; a stroke and its retreat are one.
+        motions_per_attempt: 2 where an attempt is a stroke and the way back.
         return_: sum of rewards, undiscounted.
         seconds: s, time the robot spent on its motions.
         overflows: physics steps in which the engine had no room for every contact.
@@ -53,7 +53,12 @@ class Episode:
     return_: float
     seconds: float
     overflows: int = 0
-    attempts: int = 0
+    motions_per_attempt: int = 1
+
+    @property
+    def attempts(self) -> int:
+        """Executed actions."""
+        return self.motions // self.motions_per_attempt
 
     def to_dict(self) -> dict[str, Any]:
         """Return the row of the evaluation file."""

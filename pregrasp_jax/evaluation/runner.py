@@ -226,7 +226,7 @@ class Evaluator:
             reason=reason,
             success=success,
             motions=int(run.state.num_pushes) * self._env.primitive.motions,
-            attempts=int(run.state.num_pushes),
+            motions_per_attempt=self._env.primitive.motions,
             return_=float(run.return_),
             seconds=float(run.seconds),
             overflows=int(overflows),

@@ -99,7 +99,13 @@ class GraspOutcome(struct.PyTreeNode):
 
 
 def push_grasp(xy: Any, yaw: Any, aperture: Any, *, distance: Any = DISTANCE, final: Any = False) -> PushGrasp:
-    """Return the stroke that begins at `xy` [2] m with heading `yaw` () and aperture () rad, `distance` () m long."""
+    """Return the stroke that begins at `xy` [2] m with heading `yaw` () and aperture () rad, `distance` () m long.
+
+    Raises:
+        ValueError: the aperture is a plain number out of range.
+    """
+    if isinstance(aperture, int | float):
+        APERTURE.refuse(aperture)
     xy = jnp.asarray(xy, jnp.float32)
     z, yaw, aperture = (jnp.asarray(value, jnp.float32) for value in (HEIGHT, yaw, aperture))
     ahead = distance * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
