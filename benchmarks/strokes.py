@@ -25,7 +25,7 @@ from pregrasp_jax.physics import make_engine
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.spaces.workspace import TABLE
-from pregrasp_jax.task import push_grasp, registry
+from pregrasp_jax.task import push_grasp, registry, stroke_rules
 from pregrasp_jax.task.env import make_env
 from pregrasp_jax.training.stroke_collection import begin, make_collect
 from pregrasp_jax.types import MAX_OBJECTS, SceneParams
@@ -93,7 +93,7 @@ def main() -> None:
         physics = engine.run(engine.reset(engine.init(), scene), plan.ctrl, plan.num_ctrl)
         touch = engine.observe(physics).touch
         assert touch is not None
-        return push_grasp.stable(touch, tips)[0] & (touch.poses[2, 0, 2] > push_grasp.LIFTED), touch.collided
+        return stroke_rules.stable(touch, tips)[0] & (touch.poses[2, 0, 2] > push_grasp.LIFTED), touch.collided
 
     batch = scenes(len(bank.names))
     run = jax.jit(jax.vmap(attempt, (0, None)))

@@ -17,7 +17,8 @@ from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.spaces.workspace import TABLE
 from pregrasp_jax.task import push_grasp, registry
-from pregrasp_jax.task.push_grasp import GraspOutcome, end_reason, plan_stroke, stable, stroke_actions
+from pregrasp_jax.task.push_grasp import plan_stroke, stroke_actions
+from pregrasp_jax.task.stroke_rules import GraspOutcome, end_reason, stable
 from pregrasp_jax.types import MAX_OBJECTS, REASONS, SceneParams, Touch
 
 KIND = registry.get_kind("push_grasp")

@@ -19,8 +19,9 @@ from pregrasp_jax.evaluation.statistics import wilson_interval
 from pregrasp_jax.policies.scripts import Policy
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.primitive import Plan
-from pregrasp_jax.task.push_grasp import GraspOutcome, make_push_grasp, standing
+from pregrasp_jax.task.push_grasp import make_push_grasp
 from pregrasp_jax.task.stages import Stages, make_stages
+from pregrasp_jax.task.stroke_rules import GraspOutcome, standing
 from pregrasp_jax.types import EnvState
 
 HOLD_TIME = 1.0

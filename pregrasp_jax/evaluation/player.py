@@ -6,22 +6,19 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 
-from pregrasp_jax.checkpoint import TrainedPolicy, load_policy
+from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.checkpoint.policy import PPG, SHIPPED
 from pregrasp_jax.config import Config, EvaluationConfig, TaskOverrides, with_absolute_paths
-from pregrasp_jax.evaluation import EpisodeCallback, Evaluator, evaluation_document
-from pregrasp_jax.learning.imitation import StrokeFunction
-from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.evaluation import EpisodeCallback, Evaluator, evaluation_document, learned
+from pregrasp_jax.evaluation.learned import STYLES
 from pregrasp_jax.machine import announced_compilation
 from pregrasp_jax.policies import scripts
-from pregrasp_jax.policies.learned import make_learned
-from pregrasp_jax.policies.ppg import STROKE_SCRIPTS, greedy, make_ppg, make_target_ppg
+from pregrasp_jax.policies.ppg import STROKE_SCRIPTS
 from pregrasp_jax.policies.scripts import Policy
-from pregrasp_jax.spaces import grid
 from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import Env, make_env, with_task
 
@@ -30,9 +27,6 @@ NUM_ENVS = 16
 
 LOOKAHEAD_NUM_ENVS = 4
 """The same for `lookahead`, each of whose decisions simulates `scripts.LOOKAHEAD_CANDIDATES` scenes."""
-
-SHIPPED_STYLES = {"ppg": PPG, "target-ppg": PPG}
-"""Ways of playing a policy of strokes, and the one that ships for each."""
 
 _PACKING = 50
 """Scenes between two lines that say how many are packed."""
@@ -86,7 +80,7 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     if trained is None:
         return Player(_make_script(request.policy, env, config), None, env, config)
     _, style = _named(request.policy)
-    played = LEARNED[trained.config.train.method](env, trained, style)
+    played = learned.play(env, trained, style)
     if not played.fits:
         raise ValueError(f"policy {trained.origin} does not fit its network in this version of the package")
     return Player(played.policy, functools.partial(jax.jit(played.q_values), trained.params), env, config)
@@ -127,64 +121,12 @@ def run_evaluation(
     )
 
 
-class _Learned(NamedTuple):
-    """A trained policy in its environment.
-
-    Attributes:
-        policy: who decides.
-        q_values: (parameters, state) -> [H, W, K].
-        fits: whether the parameters belong to the networks.
-    """
-
-    policy: Policy
-    q_values: Callable[[Any, Any], jax.Array]
-    fits: bool
-
-
-def _play_q(env: Env, trained: TrainedPolicy, style: str) -> _Learned:
-    _refuse_style(style, trained, allowed="")
-    # Of the task that it was trained on: a window of another size is another input.
-    q_function = make_q_function(trained.config.network, trained.config.task, env.primitive.actions)
-    return _Learned(
-        policy=make_learned(env, q_function.values)(trained.params),
-        q_values=lambda params, state: q_function.values(params, state.obs, state.scene.target),
-        fits=q_function.fits(trained.params),
-    )
-
-
-def _play_strokes(env: Env, trained: TrainedPolicy, style: str) -> _Learned:
-    strokes = trained.config.strokes
-    function = StrokeFunction(strokes, env.primitive.actions)
-    styles = {
-        "ppg": lambda: make_ppg(env, greedy(function)),
-        "target-ppg": lambda: make_target_ppg(env, greedy(function, mask_radius=strokes.mask_radius), strokes),
-    }
-    _refuse_style(style, trained, allowed=", ".join(styles))
-    return _Learned(
-        policy=styles[style or "ppg"]()(trained.params),
-        q_values=lambda params, state: function.values(params, grid.dequantize_height(state.obs.height)),
-        fits=function.fits(trained.params),
-    )
-
-
-LEARNED: dict[str, Callable[[Env, TrainedPolicy, str], _Learned]] = {"q_learning": _play_q, "imitation": _play_strokes}
-"""How trained policies are played, by the name of their `train.method`."""
-
-
-def _refuse_style(style: str, trained: TrainedPolicy, *, allowed: str) -> None:
-    """Refuse a way of playing that a policy does not know."""
-    if style and style not in allowed.split(", "):
-        raise ValueError(
-            f"policy {style}:{trained.origin} cannot be played so; allowed: {allowed or 'the folder alone'}"
-        )
-
-
 def _named(spec: str) -> tuple[str, str]:
     """Return which folder (or name) a policy is in, and in what style it is played: `STYLE`, or `STYLE:FOLDER`."""
     style, colon, folder = spec.partition(":")
-    if spec in SHIPPED_STYLES:
-        return SHIPPED_STYLES[spec], spec
-    return (folder, style) if colon and style in SHIPPED_STYLES else (spec, "")
+    if spec in STYLES:
+        return PPG, spec
+    return (folder, style) if colon and style in STYLES else (spec, "")
 
 
 def _load(spec: str) -> Any:
@@ -194,7 +136,7 @@ def _load(spec: str) -> Any:
     folder, _ = _named(spec)
     if SHIPPED.get(folder, Path(folder)).exists():
         return load_policy(folder)
-    shipped = [name for name in ("pretrained", *SHIPPED_STYLES) if SHIPPED[_named(name)[0]].exists()]
+    shipped = [name for name in ("pretrained", *STYLES) if SHIPPED[_named(name)[0]].exists()]
     names = ", ".join([*scripts.SCRIPTS, *STROKE_SCRIPTS, *shipped])
     raise ValueError(f"policy {spec} does not exist; allowed: {names}, or a run folder")
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from pregrasp_jax import messages
 from pregrasp_jax.physics import ENGINES
 from pregrasp_jax.physics.base import Engine
-from pregrasp_jax.task import push, push_grasp, rules
+from pregrasp_jax.task import push, push_grasp, rules, stroke_rules
 from pregrasp_jax.task.primitive import Primitive
 from pregrasp_jax.task.rules import Rules
 
@@ -27,7 +27,7 @@ class Kind(NamedTuple):
 
 KINDS: dict[str, Kind] = {
     "push": Kind(push.make_push, rules.make_rules),
-    "push_grasp": Kind(push_grasp.make_push_grasp, push_grasp.make_rules, {"native": push_grasp.make_engine}),
+    "push_grasp": Kind(push_grasp.make_push_grasp, stroke_rules.make_rules, {"native": push_grasp.make_engine}),
 }
 """Kinds by the name that `task.primitive` knows them by; add your own before you make an environment."""
 

@@ -21,8 +21,8 @@ from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.workspace import TABLE
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.primitive import Plan
-from pregrasp_jax.task.push_grasp import GraspOutcome, standing
 from pregrasp_jax.task.stages import Stages, make_stages
+from pregrasp_jax.task.stroke_rules import GraspOutcome, standing
 from pregrasp_jax.types import EnvState, HullBank, StepResult
 
 _NEIGHBOURHOOD = 0.2
