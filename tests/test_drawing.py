@@ -125,6 +125,7 @@ def test_of_many_choices_the_best_are_drawn_and_the_chosen_one_among_them():
     best = [2, 4, 5, 0, 3]
     assert names[0] == sorted(best[: len(names[0])]) and 1 < len(names[0]) < 7
     assert names[1] == sorted([1, *best[: len(names[0]) - 1]])
+    assert [caption for caption, _ in tiles(taken=worst, q_values=None)[3:]] == ["push held 1"], "no values, one map"
 
 
 def test_contact_sheet_shows_every_object():

@@ -66,8 +66,10 @@ def make_tiles(
     scene = draw_camera(hulls, target_slot=target_slot, camera=side_view((300, 400)))
     tiles = [("scene", scene), ("height, 0 to 0.30 m", draw_heightmap(np.asarray(obs.height)))]
     tiles.append(("segmentation", draw_segmentation(np.asarray(obs.instance_ids), target_slot=target_slot)))
+    # Of many choices without values only the chosen one says anything.
+    count = 1 if q_values is None and mask.shape[-1] > _MAX_MAPS else _MAX_MAPS
     best = np.where(mask, values, -np.inf).max(axis=(0, 1))
-    first = np.argsort(-np.where(np.arange(len(best)) == choice_taken, np.inf, best), kind="stable")[:_MAX_MAPS]
+    first = np.argsort(-np.where(np.arange(len(best)) == choice_taken, np.inf, best), kind="stable")[:count]
     for choice in sorted(first):
         chosen, shown = push if choice == choice_taken else None, mask[..., choice]
         image = draw_q_map(values[..., choice], shown, push=chosen, limits=limits, backdrop=np.asarray(obs.height))
