@@ -1,10 +1,11 @@
 """Full environment steps per second, split by stage; prints one JSON object.
 
-    python benchmarks/env.py --scenes 16 [--compare pybullet]
+    python benchmarks/env.py --scenes 16 [--compare pybullet] [--against shelf]
 
 A step is a push of mean length 0.1 m by every scene: planning, physics, heightmap, judging, and a reset of the
 scenes that ended. `--compare pybullet` runs the same hulls and push lengths in two PyBullet processes, each
 step with one 640 x 480 TinyRenderer depth and segmentation image (PyBullet must be installed by hand).
+`--against NAME` steps another place by turns with the open table, so that both meet the same load.
 """
 
 import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
@@ -97,6 +98,42 @@ def measure(num_scenes: int, num_steps: int) -> dict[str, Any]:
         "unreachable_share": float(np.mean([x == 0 for x in lengths])),
         "ms_per_env_step": {name: 1e3 * value / num_scenes for name, value in parts.items()},
         "cores": len(os.sched_getaffinity(0)),
+    }
+
+
+def compare_places(name: str, num_scenes: int, num_steps: int) -> dict[str, Any]:
+    """Step scenes on the open table and in the place `name` by turns.
+
+    Pushes that a wall forbids cost no physics, so the rates are also given per push that was executed.
+    """
+    config = PRESETS["cpu"]
+    config = dataclasses.replace(config, scene=dataclasses.replace(config.scene, validation_scenes=50))
+    key = jax.random.key(0)
+    steps, states, places = [], [], (config.task.workspace, name)
+    for place in places:
+        task = dataclasses.replace(config.task, workspace=place)
+        env = make_env(dataclasses.replace(config, task=task), split="validation")
+        step = jax.jit(functools.partial(full_step, env))
+        state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, num_scenes))
+        states.append(jax.block_until_ready(step(state, key))[0])  # compiles
+        steps.append(step)
+    wall, cpu, executed = np.zeros((3, 2))
+    for i in range(num_steps):
+        for which in (0, 1) if i % 2 else (1, 0):
+            start = time.perf_counter(), time.process_time()
+            states[which], moved = jax.block_until_ready(steps[which](states[which], jax.random.fold_in(key, i)))
+            wall[which] += time.perf_counter() - start[0]
+            cpu[which] += time.process_time() - start[1]
+            executed[which] += int((np.asarray(moved) > 0).sum())
+    total = num_scenes * num_steps
+    return {
+        "places": places,
+        "env_steps_per_second": (total / wall).tolist(),
+        "env_steps_per_cpu_second": (total / cpu).tolist(),
+        "executed_share": (executed / total).tolist(),
+        "ratio": float(wall[0] / wall[1]),
+        "ratio_cpu": float(cpu[0] / cpu[1]),
+        "ratio_cpu_of_executed": float(cpu[0] / executed[0] / (cpu[1] / executed[1])),
     }
 
 
@@ -225,7 +262,11 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=16, help="scenes stepped in parallel")
     parser.add_argument("--steps", type=int, default=40, help="parallel steps")
     parser.add_argument("--compare", choices=["pybullet"], help="also run the reference simulator")
+    parser.add_argument("--against", help="compare the open table with this place, and nothing else")
     arguments = parser.parse_args()
+    if arguments.against:
+        print(json.dumps(compare_places(arguments.against, arguments.scenes, arguments.steps)))
+        return
     result = measure(arguments.scenes, arguments.steps)
     if arguments.compare:
         reference = compare_pybullet(30)

@@ -25,7 +25,7 @@ from pregrasp_jax.config import LearnerConfig, NetworkConfig, TaskConfig
 from pregrasp_jax.learning import learner
 from pregrasp_jax.learning.networks import num_parameters
 from pregrasp_jax.learning.q_function import make_q_function
-from pregrasp_jax.learning.replay import Batch
+from pregrasp_jax.learning.replay import UNKNOWN, Batch
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.spaces.grid import GRID_SIZE
 from pregrasp_jax.spaces.workspace import TABLE
@@ -60,16 +60,18 @@ def random_batch(key: jax.Array, batch_size: int) -> Batch:
     return Batch(
         inputs=jax.random.normal(key_inputs, shape),
         next_inputs=jax.random.normal(key_next, shape),
-        action=jax.random.randint(key_action, (batch_size,), 0, 2 * GRID_SIZE**2),
-        reward=jnp.ones(batch_size),
-        terminated=jnp.zeros(batch_size, bool),
-        reason=jnp.zeros(batch_size, jnp.int32),
+        action=jax.random.randint(key_action, (batch_size, 1), 0, 2 * GRID_SIZE**2),
+        reward=jnp.ones((batch_size, 1)),
+        terminated=jnp.zeros((batch_size, 1), bool),
+        reason=jnp.zeros((batch_size, 1), jnp.int32),
         next_hand=HandPose(
             jax.random.uniform(key_xy, (batch_size, 2), minval=-0.2, maxval=0.1), *jnp.zeros((3, batch_size))
         ),
         importance_weights=jnp.ones(batch_size),
         hindsight=jnp.zeros(batch_size, bool),
-        rows=jnp.arange(batch_size),
+        rows=jnp.arange(batch_size)[:, None],
+        drawn=jnp.ones((batch_size, 1), bool),
+        next_values=jnp.full((batch_size, 1), UNKNOWN),
     )
 
 
@@ -96,7 +98,7 @@ def measure(width: float, batch: Batch, *, repetitions: int, seconds: float) -> 
 
     def step() -> jax.Array:
         nonlocal state
-        state, errors, _ = update(state, batch)
+        state, errors, *_ = update(state, batch)
         return errors
 
     options = {"repetitions": repetitions, "seconds": seconds}

@@ -1,6 +1,6 @@
 """Compile seconds and physics steps per second of the mjx engine, and of stock MJX; prints one JSON object.
 
-    python benchmarks/mjx.py [--scenes 2 16 64] [--sizes 8x4 4x1] [--compare 6] [--rows 5]
+    python benchmarks/mjx.py [--scenes 2 16 64] [--sizes 8x4 4x1] [--compare 6] [--rows 5] [--workspaces table shelf]
 
 Scenes are rows of objects beside each other with the hand in front of them, so that contacts exist. `--compare N`
 also runs N objects of one hull each with our collisions and with `mjx.step` on the same solver options, where every
@@ -31,7 +31,7 @@ from pregrasp_jax.physics.hull_collision import Limits
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.scene.spec import compile_spec, scene_spec
-from pregrasp_jax.spaces.workspace import TABLE
+from pregrasp_jax.spaces.workspace import TABLE, Workspace, get_workspace
 from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, HullBank, SceneParams
 
 ROBOT = get_robot("ur5e_rg2")
@@ -76,10 +76,17 @@ def measure(function: Any, arguments: tuple[Any, ...], steps: int, repeats: int 
 
 
 def measure_ours(
-    bank: HullBank, num_scenes: int, rows: int, *, objects: int, hulls: int, limits: Limits
+    bank: HullBank,
+    num_scenes: int,
+    rows: int,
+    *,
+    objects: int,
+    hulls: int,
+    limits: Limits,
+    workspace: Workspace = TABLE,
 ) -> dict[str, Any]:
     """Time the engine with `objects` slots of `hulls` geoms, all scenes different."""
-    engine = mjx.make_engine(bank, ROBOT, TABLE, num_slots=objects, num_hulls=hulls, limits=limits)
+    engine = mjx.make_engine(bank, ROBOT, workspace, num_slots=objects, num_hulls=hulls, limits=limits)
     scenes = [grid_scene(bank, objects, seed) for seed in range(num_scenes)]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *scenes)
     state = jax.vmap(lambda scene: engine.reset(engine.init(), scene))(batch)
@@ -91,6 +98,7 @@ def measure_ours(
     overflows = int(jnp.sum(after.overflows))
     return {
         "engine": "mjx",
+        "workspace": workspace.name,
         "scenes": num_scenes,
         "objects": objects,
         "hulls": hulls,
@@ -160,6 +168,7 @@ def main() -> None:
     )
     parser.add_argument("--compare", type=int, help="also compare with stock MJX: this many objects of one hull")
     parser.add_argument("--rows", type=int, default=5, help="control rows (20 ms) of a measurement")
+    parser.add_argument("--workspaces", nargs="+", default=[TABLE.name], help="places, by name")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_compilation_cache", False)
     bank = builtin_bank("seen")
@@ -169,7 +178,9 @@ def main() -> None:
         for objects, hulls in arguments.sizes:
             fitting = select(bank, np.flatnonzero(count <= hulls))
             sizes = {"objects": objects, "hulls": hulls}
-            rows.append(measure_ours(fitting, scenes, arguments.rows, **sizes, limits=mjx.LIMITS))
+            for name in arguments.workspaces:
+                place = {"workspace": get_workspace(name), "limits": mjx.LIMITS}
+                rows.append(measure_ours(fitting, scenes, arguments.rows, **sizes, **place))
         if arguments.compare:
             single = select(bank, np.flatnonzero(count == 1))
             # As many as stock makes: nothing culled, nothing dropped.

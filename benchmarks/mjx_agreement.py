@@ -1,6 +1,7 @@
 """How far the mjx engine agrees with C MuJoCo on packed scenes; prints one JSON object.
 
     python benchmarks/mjx_agreement.py [--states 200] [--scenes 50] [--batch 10] [--object-set seen] [--object-dir DIR]
+        [--walls]
 
 Contacts: pairs of geoms that touch in random states, packed and pressed together or scattered around the arm, by
 distance and normal against C on the same hulls, and against the exact least translation.
@@ -8,7 +9,8 @@ distance and normal against C on the same hulls, and against the exact least tra
 Pushes: every packed scene is moved until it lies just before the fingers, then pushed by 0.15 m towards its target, by
 mjx, by native with the options and hulls of mjx, by the same from poses that are shifted by a micrometre, and by
 native as it is. Compared are final positions, of all objects and of those that native moved by more than 1 mm, and
-what the task makes of the push: the reason of an ending, the reward, success.
+what the task makes of the push: the reason of an ending, the reward, success. With `--walls` a shelf stands so close
+around these scenes that many objects are pushed against it; scenes that do not fit in are left out.
 """
 
 import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
@@ -28,6 +30,7 @@ import numpy as np
 
 from pregrasp_jax.assets.sets import load_bank_for
 from pregrasp_jax.config import Config, SceneConfig
+from pregrasp_jax.geometry import quat_to_matrix
 from pregrasp_jax.physics import mjx, native
 from pregrasp_jax.physics.base import Engine
 from pregrasp_jax.physics.mjx_model import make_mjx_slot_model, make_reference_model
@@ -35,7 +38,7 @@ from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.spaces import grid
-from pregrasp_jax.spaces.workspace import TABLE
+from pregrasp_jax.spaces.workspace import TABLE, Workspace, get_workspace
 from pregrasp_jax.task.env import Env, assemble
 from pregrasp_jax.task.push import push_actions
 from pregrasp_jax.task.rules import TARGET_IN_REGION
@@ -54,6 +57,32 @@ SHIFT = 1e-6
 
 MOVED = 1e-3
 """m; an object that native pushed farther than this counts as moved."""
+
+
+CLOSE = get_workspace("shelf", {"front": FIRST_X, "half_width": 0.17, "back": 0.13})
+"""Walls around scenes that begin at `FIRST_X`, nearer than a task allows, for the hand does not go far here."""
+
+
+def fitting(bank: HullBank, scenes: SceneBank, workspace: Workspace) -> np.ndarray:
+    """Return the indices of the scenes that stand clear of walls once they are moved as `near_scenes` does."""
+    near, inside = near_scenes(bank, scenes, len(scenes)), []
+    for i, (ids, poses) in enumerate(zip(np.asarray(near.object_ids), np.asarray(near.poses), strict=True)):
+        points = [
+            np.asarray(bank.full.vertices)[hull] @ quat_to_rotation(poses[slot, 3:]).T + poses[slot, :3]
+            for slot in np.flatnonzero(ids >= 0)
+            for hull in np.asarray(bank.object_hulls)[ids[slot]]
+            if hull >= 0
+        ]
+        x, y = np.concatenate(points)[:, :2].T
+        back, left, _ = workspace.walls
+        fits = x.max() < back.corners()[:, 0].min() and np.abs(y).max() < left.corners()[:, 1].min()
+        inside += [i] if fits else []
+    return np.array(inside, int)
+
+
+def quat_to_rotation(quat: np.ndarray) -> np.ndarray:
+    """Return the rotation [3, 3] of a quaternion."""
+    return np.asarray(quat_to_matrix(jnp.asarray(quat)))
 
 
 def near_scenes(bank: HullBank, scenes: SceneBank, count: int, shift: float = 0.0) -> SceneParams:
@@ -140,8 +169,15 @@ def percentiles(values: np.ndarray) -> dict[str, float] | None:
     )
 
 
-def measure_pushes(bank: HullBank, scenes: SceneBank, count: int, batch: int) -> dict[str, Any]:
-    """Push the same scenes with all engines and compare."""
+def measure_pushes(bank: HullBank, scenes: SceneBank, count: int, batch: int, workspace: Workspace) -> dict[str, Any]:
+    """Push the same scenes with all engines and compare.
+
+    The task is that of the open table; only the engines know of walls.
+    """
+    if workspace.walls:
+        chosen = fitting(bank, scenes, workspace)[:count]
+        rows = {name: getattr(scenes, name)[chosen] for name in ("object_ids", "poses", "yaw", "target", "seeds")}
+        scenes, count = dataclasses.replace(scenes, **rows), len(chosen)
     env = assemble(Config(), bank, scenes)
     near, shifted = (near_scenes(bank, scenes, count, shift) for shift in (0.0, SHIFT))
     actions = actions_towards_targets(near)
@@ -149,12 +185,12 @@ def measure_pushes(bank: HullBank, scenes: SceneBank, count: int, batch: int) ->
     def with_engine(engine: Engine, start: SceneParams, size: int) -> dict[str, np.ndarray]:
         return push_all(dataclasses.replace(env, engine=engine), start, actions, size)
 
-    reference = native.make_engine(bank, ROBOT, TABLE, model=make_reference_model(bank, ROBOT, TABLE))
+    reference = native.make_engine(bank, ROBOT, workspace, model=make_reference_model(bank, ROBOT, workspace))
+    itself = native.make_engine(bank, ROBOT, workspace)
     c, c_shifted, own = (
-        with_engine(engine, start, count)
-        for engine, start in ((reference, near), (reference, shifted), (env.engine, near))
+        with_engine(engine, start, count) for engine, start in ((reference, near), (reference, shifted), (itself, near))
     )
-    ours = with_engine(mjx.make_engine(bank, ROBOT, TABLE), near, batch)
+    ours = with_engine(mjx.make_engine(bank, ROBOT, workspace), near, batch)
     present = np.asarray(near.object_ids) >= 0
     return {
         "scenes": count,
@@ -208,18 +244,20 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=50, help="packed scenes that are pushed, 0: none")
     parser.add_argument("--batch", type=int, default=10, help="scenes that mjx pushes side by side")
     parser.add_argument("--object-set", choices=["seen", "unseen"], default="seen", help="which objects")
+    parser.add_argument("--walls", action="store_true", help="push scenes between walls")
     parser.add_argument("--object-dir", help="folder of meshes instead of the built-in catalogue")
     arguments = parser.parse_args()
     bank = load_bank_for(arguments.object_dir, arguments.object_set)
-    scenes = scene_bank.load_or_build(
-        bank, ROBOT.eligibility(bank).eligible, SceneConfig(test_scenes=max(arguments.scenes, 3)), "test"
-    )
+    wanted = max(arguments.scenes, 3) if not arguments.walls else 4 * max(arguments.scenes, 3)
+    scenes = scene_bank.load_or_build(bank, ROBOT.eligibility(bank).eligible, SceneConfig(test_scenes=wanted), "test")
     versions = {name: metadata.version(name) for name in ("mujoco", "mujoco-mjx", "jax", "jaxlib")}
     document: dict[str, Any] = {"device": jax.devices()[0].device_kind, "versions": versions}
     if arguments.states:
         document["contacts"] = measure_contacts(bank, scenes, arguments.states)
     if arguments.scenes:
-        document["pushes"] = measure_pushes(bank, scenes, arguments.scenes, arguments.batch)
+        document["pushes"] = measure_pushes(
+            bank, scenes, arguments.scenes, arguments.batch, CLOSE if arguments.walls else TABLE
+        )
     print(json.dumps(document))
 
 

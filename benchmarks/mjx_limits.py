@@ -52,7 +52,7 @@ def states_of_pushes(env: Env, scenes: int, pushes: int, every: int) -> Iterator
             count = np.clip(left - first, 0, every)
             physics = run(physics, ctrl, jnp.asarray(count, jnp.int32))
             yield object_ids[count > 0], np.asarray(coordinates(physics)[0])[count > 0]
-        states, result = conclude(states, actions, plans.reachable, physics)
+        states, result = conclude(states, plans.replace(ctrl=None), physics)
         runs &= np.asarray(result.reason) == RUNNING
 
 

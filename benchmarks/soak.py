@@ -27,6 +27,7 @@ from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.training import collect
+from pregrasp_jax.training.schedules import known_length, make_pace
 from pregrasp_jax.types import EnvState
 
 MIN_HEIGHT = -0.01
@@ -63,13 +64,14 @@ def soak(env: Env, num_pushes: int, config: Config) -> dict[str, Any]:
     make_actors = functools.partial(collect.init_actors, env=env, num_envs=config.train.num_envs)
     actors = jax.jit(make_actors)(jax.random.key(config.seed))
     push = collect.make_collect(env, q, config.exploration, warmup=config.learner.warmup)
-    push = push.compile(actors, params)
+    pace = make_pace(config, known_length(config) or num_pushes)
+    push = push.compile(actors, params, pace)
     num_steps = -(-num_pushes // config.train.num_envs)
     marks = {max(1, round(share * num_steps)): f"{share:.0%}" for share in (0.1, 0.5, 1.0)}
     memory, astray = {}, 0
     start = time.perf_counter()
     for step in range(1, num_steps + 1):
-        actors, experience = push(actors, params)
+        actors, experience = push(actors, params, pace)
         astray += num_astray(actors.env_states, experience.steps.outcome)
         if step in marks:
             memory[marks[step]] = memory_bytes()

@@ -52,7 +52,7 @@ def fill(program: Program, state: TrainState) -> tuple[TrainState, Any]:
     collect, learning = jax.jit(program.collect), Chain(program.remember, state.learning)
     actors, experience = state.actors, None
     for _ in range(STEPS):
-        actors, experience = collect(actors, learning.state.learner.params)
+        actors, experience = collect(actors, learning.state.learner.params, program.pace)
         learning(experience)
     return TrainState(actors, learning.state), experience
 
@@ -84,7 +84,7 @@ def measure(config: Config) -> dict[str, Any]:
     batch = sample(memory, key)
     keys = jax.random.split(key, num_envs)
     ms = {
-        "collect": best_ms(lambda: collect(state.actors, params)),
+        "collect": best_ms(lambda: collect(state.actors, params, program.pace)),
         "act": best_ms(lambda: act(params, states)),
         "reset": best_ms(lambda: reset(keys)),
         "sample": best_ms(lambda: sample(memory, key)),
@@ -98,7 +98,7 @@ def measure(config: Config) -> dict[str, Any]:
     remember = Chain(program.remember, learning)
     ms["remember"] = best_ms(lambda: remember(experience))
     update = Chain(program.update, remember.state)
-    ms["update"] = best_ms(lambda: update(jnp.float32(0.4)))
+    ms["update"] = best_ms(lambda: update(jnp.float32(0.4), program.pace))
     return summary(ms, config)
 
 

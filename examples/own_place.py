@@ -1,4 +1,4 @@
-"""A place of your own: a narrow table with a wall along its left side.
+"""A place of your own: a table with a wall along its left side that ends early on the right.
 
 Prints how often `clear` gets the target between its fingers there and on the open table, on the same scenes, and why it
 fails; `--picture FILE.png` draws the first scene:
@@ -25,15 +25,15 @@ from pregrasp_jax.report.play import env_hulls
 from pregrasp_jax.spaces.workspace import WORKSPACES, Box, Workspace
 from pregrasp_jax.task.env import Env, make_env
 
-NARROW = Workspace(
-    name="narrow",
+LEDGE = Workspace(
+    name="ledge",
     low=(-0.25, -0.22),  # an object whose centre of mass passes here has left
     high=(0.25, math.inf),  # the wall keeps it
     walls=(Box(center=(0.0, 0.26, 0.06), half_size=(0.25, 0.014, 0.06)),),
 )
 """m. Walls collide with objects and fingers; pushes that bring the arm too near to one are unreachable."""
 
-WORKSPACES[NARROW.name] = NARROW
+WORKSPACES[LEDGE.name] = LEDGE
 
 
 def make_place(config: Config, name: str) -> Env:
@@ -51,13 +51,13 @@ def draw(env: Env, path: Path) -> None:
 def main(*, scenes: int = 50, num_envs: int = 16, picture: Path | None = None) -> dict[str, EvaluationResult]:
     """Evaluate `clear` in both places, without the grasp."""
     config = Config(scene=SceneConfig(test_scenes=scenes)).validate()
-    envs, results = {name: make_place(config, name) for name in ("table", NARROW.name)}, {}
+    envs, results = {name: make_place(config, name) for name in ("table", LEDGE.name)}, {}
     for name, env in envs.items():
         results[name] = evaluate_policy(env, make_clear(env), episodes=scenes, num_envs=num_envs, with_grasp=False)
         failures = results[name].failures or "none"
         print(f"{name}: {results[name].success_rate:.0%} of {scenes} scenes, failures {failures}")
     if picture:
-        draw(envs[NARROW.name], picture)
+        draw(envs[LEDGE.name], picture)
     return results
 
 

@@ -59,10 +59,10 @@ def train(env: Env, config: Config, *, updates: int) -> Trained:
     first = jax.device_get(learning.learner.params)  # a copy: the programs reuse the memory of what they are given
     done = 0
     while done < updates:
-        actors, experience = program.collect(actors, learning.learner.params)
+        actors, experience = program.collect(actors, learning.learner.params, program.pace)
         learning = program.remember(learning, experience)
         if int(actors.tally.env_steps) > config.learner.warmup:
-            learning = program.update(learning, np.float32(config.replay.importance_exponent))
+            learning = program.update(learning, np.float32(config.replay.importance_exponent), program.pace)
             done += 1
     return Trained(first, jax.device_get(learning.learner.params), done)
 

@@ -17,6 +17,9 @@ EngineName = Literal["native", "mjx"]
 CameraName = Literal["orthographic", "pinhole"]
 Architecture = Literal["paper", "compact"]
 ObjectSet = Literal["seen", "unseen"]
+Method = Literal["q_learning", "imitation"]
+FreeSpace = Literal["feasible", "cluster"]
+Normalization = Literal["none", "batch"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +30,9 @@ class AssetsConfig:
     """Folder of meshes, see docs/meshes.md (DIR/seen and DIR/unseen if present); None is the built-in catalogue."""
     object_set: ObjectSet = "seen"
     """Training uses `seen`; `unseen` holds objects kept for evaluation (Sec. IV-A)."""
+    variants: int = 0
+    """Objects made beside those of the set: scaled, drawn from families, cut and joined. Training meets them with the
+    set's own; validation and `evaluate` meet only others that were made in the same way. See docs/learning.md."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,11 +54,31 @@ class SceneConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlaceConfig:
+    """Dimensions of the place; null is its own. One that it does not have is refused."""
+
+    half_width: float | None = None
+    """m, from the middle to the side walls of `shelf`, or to where the table ends in `narrow`."""
+    back: float | None = None
+    """m, x of the inner face of the back wall of `shelf`."""
+    front: float | None = None
+    """m, x where the side walls of `shelf` begin and objects leave."""
+    wall_height: float | None = None
+    """m."""
+    wall_thickness: float | None = None
+    """m."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TaskConfig:
     """The task of the paper: pushes in a half ring, ten per episode."""
 
     workspace: str = "table"
-    """Where: a name in `spaces.workspace.WORKSPACES`."""
+    """Where: `table`, `shelf`, `narrow` or another name in `spaces.workspace.WORKSPACES` (docs/confined.md)."""
+    place: PlaceConfig = field(default_factory=PlaceConfig)
+    mirrored_start: bool = True
+    """Between walls, start in the mirror image of the arm's posture if the target lies on the right (y < 0), so that
+    the wrist is on the roomier side; False starts in one posture always."""
     robot: str = "ur5e_rg2"
     """Who: a name in `robot.ROBOTS`."""
     primitive: str = "push"
@@ -76,6 +102,9 @@ class TaskConfig:
     """m/s, mean speed of the minimum-jerk push."""
     camera: CameraName = "orthographic"
     """`orthographic` draws exact heightmaps; `pinhole` sees what a 640 x 480 overhead RGB-D camera sees."""
+    sensor: str = "clean"
+    """What that camera, the masks and the objects get wrong: clean, d435, d455, or a .yaml file (docs/deploy.md). Needs
+    `pinhole`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,8 +141,10 @@ class ReplayConfig:
     """Alpha of prioritized replay; 0 samples uniformly."""
     importance_exponent: float = 0.4
     """Beta at the start."""
-    importance_steps: int = 150_000
-    """Env steps over which beta rises linearly to 1."""
+    importance_steps: int | None = None
+    """Env steps over which beta rises linearly to 1; None takes `importance_fraction` of the run."""
+    importance_fraction: float = 5 / 6
+    """Share of the run over which beta rises."""
     hindsight: bool = True
     """Replay episodes that enclosed an obstacle with that obstacle as the target; False is the No-HER ablation."""
 
@@ -126,8 +157,10 @@ class LearnerConfig:
     """Adam step size."""
     final_learning_rate: float = 1e-4
     """Adam step size at the end of a linear decay."""
-    learning_rate_steps: int = 0
-    """Updates over which the step size decays; 0 keeps it."""
+    learning_rate_steps: int | None = None
+    """Updates over which the step size decays; 0 keeps it, None takes `learning_rate_fraction` of the run."""
+    learning_rate_fraction: float = 1.0
+    """Share of the run over which the step size decays."""
     discount: float = 0.5
     """Gamma."""
     polyak: float = 0.999
@@ -138,6 +171,8 @@ class LearnerConfig:
     """Transitions per update; with `mjx` on several devices a multiple of their number."""
     updates_per_step: float = 0.25
     """Updates per env step (a push of one scene); 16 scenes at 0.25 make 4 updates per parallel step."""
+    siblings: bool = False
+    """Learn from all pushes that were made from a state (`exploration.branches`) whenever one of them is sampled."""
     warmup: int = 500
     """Env steps of pure exploration before the first update."""
 
@@ -150,8 +185,10 @@ class ExplorationConfig:
     """Share of random actions at the first env step."""
     epsilon_end: float = 0.1
     """Share of random actions after the decay."""
-    epsilon_decay: int = 20_000
-    """Env steps over which epsilon falls linearly."""
+    epsilon_decay: int | None = None
+    """Env steps over which epsilon falls linearly; None takes `epsilon_fraction` of the run."""
+    epsilon_fraction: float = 1 / 9
+    """Share of the run over which epsilon falls."""
     guided: bool = True
     """Random actions aim at the target inside the half ring; False draws from all 20 000 (Random-Exp ablation)."""
     angle_std: float = 0.5
@@ -162,18 +199,58 @@ class ExplorationConfig:
     """More pushes simulated from every state, only to learn from: drawn like the real one, but softmax for greedy."""
     branch_temperature: float = 0.1
     """Temperature of that softmax, in units of Q."""
+    branch_spacing: float = 0.0
+    """m; greedy branches are the best pushes that end so far apart, as those of a search; 0 draws by the softmax."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StrokesConfig:
+    """PPG: strokes learnt by imitation of random ones that ended in a stable grasp."""
+
+    positives: int = 10_000
+    """Stable grasps to collect before the training."""
+    attempts: int = 15
+    """Strokes in a scene before the next one; it also ends when at most one object is left."""
+    singulation: bool = False
+    """Learn only from grasps before which the push took the object 15 mm farther away from its neighbours."""
+    collection: str | None = None
+    """Run whose stable grasps are learnt from; null collects its own."""
+    width: float = 0.25
+    """Factor on all channel counts of the network; 1.0 has the 10 M parameters of the original."""
+    normalization: Normalization = "none"
+    """`batch` normalises as the original does, in training by the batch alone."""
+    epochs: int = 15
+    """Passes over the stable grasps."""
+    batch_size: int = 8
+    """Stable grasps per update."""
+    learning_rate: float = 3e-4
+    """Adam step size at the start; it falls to 0 along a half cosine."""
+    validation_share: float = 0.1
+    """Share of the stable grasps by whose loss the parameters are chosen that are kept."""
+    mask_radius: float = 0.0
+    """m; Target-PPG considers only strokes that begin so near to the target; 0 considers all."""
+    free_space: FreeSpace = "feasible"
+    """When Target-PPG reaches for the target: once a stroke can take it and nothing else, or (`cluster`) once nothing
+    stands within 10 mm of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """How long, how wide, how often."""
 
+    method: Method = "q_learning"
+    """`q_learning`: the paper's; `imitation`: PPG, see `strokes`."""
+
     num_envs: int = 16
     """Scenes stepped in parallel; with `mjx` on several devices a multiple of their number."""
     episodes: int = 45_000
     """Stop after this many episodes (the paper trains for 45 K) ..."""
+    env_steps: int = 0
+    """... or after this many env steps (pushes); 0 sets no limit ..."""
     minutes: float = 0.0
-    """... or after this many minutes of training time, resumed time included; 0 sets no limit."""
+    """... or after this many minutes of training time, resumed time included; 0 sets no limit. The limit is the length
+    that fractions of the run refer to: `env_steps` if given, else episodes of four pushes or the env steps that fit
+    into the minutes, whichever is less. These are settled once, by the speed after the warm-up."""
     checkpoint_minutes: float = 5.0
     """Time between checkpoints: the most that a crash can lose."""
     evaluate_every: int = 5_000
@@ -201,6 +278,7 @@ class Config:
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
+    strokes: StrokesConfig = field(default_factory=StrokesConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
     def validate(self) -> "Config":
@@ -209,10 +287,7 @@ class Config:
         Raises:
             ValueError: a value is outside its range; one line names the key, the value and the range.
         """
-        for key, (low, high) in _RANGES.items():
-            value = operator.attrgetter(key)(self)
-            if value is not None and not low <= value <= high:
-                raise ValueError(f"{key} = {value} is out of range; allowed is {low} to {high}")
+        _check_ranges(self, _RANGES)
         if self.task.r_in >= self.task.r_out:
             raise ValueError(f"task.r_in = {self.task.r_in} must be below task.r_out = {self.task.r_out}")
         if self.scene.min_objects > self.scene.max_objects:
@@ -220,6 +295,13 @@ class Config:
                 f"scene.min_objects = {self.scene.min_objects} must not exceed scene.max_objects = "
                 f"{self.scene.max_objects}"
             )
+        if not self.exploration.branches:
+            for key in ("learner.siblings", "exploration.branch_spacing"):
+                if value := operator.attrgetter(key)(self):
+                    raise ValueError(
+                        f"{key} = {value} is about branches, and there are none; allowed is exploration.branches of "
+                        "1 or more with it"
+                    )
         return self
 
 
@@ -228,13 +310,18 @@ class TaskOverrides:
     """What an evaluation may change of the task that a policy was trained for; null keeps it."""
 
     workspace: str | None = None
-    """Where: a name in `spaces.workspace.WORKSPACES`."""
+    """Where: `table`, `shelf`, `narrow` or another name in `spaces.workspace.WORKSPACES` (docs/confined.md)."""
+    place: PlaceConfig = field(default_factory=PlaceConfig)
+    mirrored_start: bool | None = None
+    """Between walls, start in the mirror image of the arm's posture if the target lies on the right (y < 0)."""
     robot: str | None = None
     """Who, for scripts: a name in `robot.ROBOTS`. A trained policy knows one robot only."""
     primitive: str | None = None
     """Does what, for scripts: a name in `task.registry.KINDS`."""
     camera: CameraName | None = None
     """What the policy sees through (`orthographic` for scripts)."""
+    sensor: str | None = None
+    """What that camera, the masks and the objects get wrong: clean, d435, d455, or a .yaml file. Needs `pinhole`."""
     r_out: float | None = None
     """m, outer radius of the half ring."""
     obstacles_may_leave: bool = False
@@ -242,15 +329,42 @@ class TaskOverrides:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlanningConfig:
+    """A search in a scene that is rebuilt from the camera's pictures, see docs/planning.md."""
+
+    budget_ms: float = 0.0
+    """ms for a decision: no round of simulations begins that would exceed it. 0 sets no limit, and results repeat."""
+    candidates: int = 10
+    """Pushes that the network proposes, 2 cm apart; scripts add to them up to 16."""
+    variants: int = 3
+    """Rebuilt scenes in which a push is tried; all but the first have disturbed poses, sizes and masses."""
+    depth: int = 2
+    """Pushes of the network that may follow a candidate."""
+
+    def validate(self) -> "PlanningConfig":
+        """Return self.
+
+        Raises:
+            ValueError: a value is outside its range; one line names the key, the value and the range.
+        """
+        _check_ranges(self, _PLANNING_RANGES, "planning.")
+        return self
+
+
+@dataclass(frozen=True, kw_only=True)
 class EvaluationConfig:
     """One evaluation."""
 
     policy: str
-    """random, guided, straight, clear, lookahead, pretrained, or a run folder."""
+    """random, guided, straight, clear, lookahead, pretrained, or a run folder; of a run of the preset `ppg` also
+    target-ppg:FOLDER, and untrained strokes or target-strokes (docs/baselines.md)."""
     assets: AssetsConfig = field(default_factory=AssetsConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     task: TaskOverrides = field(default_factory=TaskOverrides)
+    plan: bool = False
+    """Let a trained policy search in a rebuilt scene before every push."""
+    planning: PlanningConfig = field(default_factory=PlanningConfig)
     episodes: int = 100
     """Test scenes to run, from the first; all policies meet the same."""
     seed: int = 0
@@ -259,8 +373,21 @@ class EvaluationConfig:
     """Scenes side by side, 0 chooses; with `native` results do not depend on it."""
 
 
+def _check_ranges(config: Any, ranges: Mapping[str, tuple[float, float]], prefix: str = "") -> None:
+    """Refuse a value of a config that is outside its range; ``None`` is in any.
+
+    Raises:
+        ValueError: one line names the key after `prefix`, the value and the range.
+    """
+    for key, (low, high) in ranges.items():
+        value = operator.attrgetter(key)(config)
+        if value is not None and not low <= value <= high:
+            raise ValueError(f"{prefix}{key} = {value} is out of range; allowed is {low} to {high}")
+
+
 _RANGES: dict[str, tuple[float, float]] = {
     "seed": (0, 2**32 - 1),
+    "assets.variants": (0, 10_000),
     "scene.min_objects": (2, 8),
     "scene.max_objects": (2, 8),
     "scene.train_scenes": (1, 100_000),
@@ -270,6 +397,11 @@ _RANGES: dict[str, tuple[float, float]] = {
     "task.r_in": (0.005, 0.5),
     "task.r_out": (0.01, 0.5),
     "task.max_pushes": (1, 100),
+    "task.place.half_width": (0.01, 2.0),
+    "task.place.back": (0.01, 2.0),
+    "task.place.front": (-2.0, 0.0),
+    "task.place.wall_height": (0.01, 2.0),
+    "task.place.wall_thickness": (0.001, 1.0),
     "task.in_region_reward": (0.0, 100.0),
     "task.approach_reward": (0.0, 100.0),
     "task.push_speed": (0.02, 1.0),
@@ -280,9 +412,11 @@ _RANGES: dict[str, tuple[float, float]] = {
     "replay.priority_exponent": (0.0, 1.0),
     "replay.importance_exponent": (0.0, 1.0),
     "replay.importance_steps": (1, 1_000_000_000),
+    "replay.importance_fraction": (0.0, 1.0),
     "learner.learning_rate": (1e-7, 1.0),
     "learner.final_learning_rate": (0.0, 1.0),
     "learner.learning_rate_steps": (0, 1_000_000_000),
+    "learner.learning_rate_fraction": (0.0, 1.0),
     "learner.discount": (0.0, 0.999),
     "learner.polyak": (0.0, 1.0),
     "learner.huber_delta": (1e-4, 100.0),
@@ -292,12 +426,23 @@ _RANGES: dict[str, tuple[float, float]] = {
     "exploration.epsilon_start": (0.0, 1.0),
     "exploration.epsilon_end": (0.0, 1.0),
     "exploration.epsilon_decay": (1, 1_000_000_000),
+    "exploration.epsilon_fraction": (0.0, 1.0),
     "exploration.angle_std": (0.0, 10.0),
     "exploration.open_probability": (0.0, 1.0),
     "exploration.branches": (0, 64),
     "exploration.branch_temperature": (1e-3, 100.0),
+    "exploration.branch_spacing": (0.0, 0.5),
+    "strokes.positives": (2, 10_000_000),
+    "strokes.attempts": (1, 1000),
+    "strokes.width": (1 / 32, 4.0),
+    "strokes.epochs": (1, 100_000),
+    "strokes.batch_size": (1, 4096),
+    "strokes.learning_rate": (1e-7, 1.0),
+    "strokes.validation_share": (0.0, 0.9),
+    "strokes.mask_radius": (0.0, 1.0),
     "train.num_envs": (1, 65_536),
     "train.episodes": (1, 1_000_000_000),
+    "train.env_steps": (0, 1_000_000_000),
     "train.minutes": (0.0, 1e6),
     "train.checkpoint_minutes": (0.0, 1e6),
     "train.evaluate_every": (0, 1_000_000_000),
@@ -305,19 +450,26 @@ _RANGES: dict[str, tuple[float, float]] = {
     "train.fused_iterations": (0, 1_000_000),
 }
 
+_PLANNING_RANGES: dict[str, tuple[float, float]] = {
+    "budget_ms": (0.0, 600_000.0),
+    "candidates": (1, 64),
+    "variants": (1, 8),
+    "depth": (0, 8),
+}
+
 _CPU = Config(
     scene=SceneConfig(validation_scenes=100),
     network=NetworkConfig(architecture="compact", width=0.25, initial_bias=0.5, mirror=True),
-    replay=ReplayConfig(capacity=100_000, importance_steps=50_000),
+    replay=ReplayConfig(capacity=100_000, importance_fraction=0.8),
     learner=LearnerConfig(
         learning_rate=1e-3,
         final_learning_rate=2e-5,
-        learning_rate_steps=100_000,
+        learning_rate_fraction=0.8,
         polyak=0.995,
         huber_delta=1.0,
         updates_per_step=2.0,
     ),
-    exploration=ExplorationConfig(epsilon_decay=10_000, branches=3),
+    exploration=ExplorationConfig(epsilon_fraction=0.16, branches=3),
     train=TrainConfig(num_envs=16, episodes=25_000, minutes=150.0, evaluate_every=2_500),
 )
 
@@ -326,23 +478,28 @@ PRESETS: dict[str, Config] = {
         scene=SceneConfig(train_scenes=4, validation_scenes=2, test_scenes=2),
         network=NetworkConfig(width=0.0625),
         replay=ReplayConfig(capacity=256, importance_steps=200),
-        learner=LearnerConfig(batch_size=4, warmup=8, updates_per_step=0.5),
+        learner=LearnerConfig(batch_size=4, warmup=8, updates_per_step=0.5, learning_rate_steps=0),
         exploration=ExplorationConfig(epsilon_decay=64),
         train=TrainConfig(num_envs=2, episodes=1_000_000, minutes=1.0, evaluate_every=0, log_every=2),
     ),
     "demo": dataclasses.replace(
         _CPU,
         scene=SceneConfig(train_scenes=64, validation_scenes=10, test_scenes=50),
-        replay=ReplayConfig(capacity=10_000, importance_steps=2_000),
-        learner=dataclasses.replace(_CPU.learner, final_learning_rate=1e-4, learning_rate_steps=4_000),
-        exploration=dataclasses.replace(_CPU.exploration, epsilon_decay=2_000),
+        replay=ReplayConfig(capacity=10_000, importance_fraction=1.0),
+        learner=dataclasses.replace(_CPU.learner, final_learning_rate=1e-4, learning_rate_fraction=1.0),
+        exploration=dataclasses.replace(_CPU.exploration, epsilon_fraction=1.0),
         train=TrainConfig(num_envs=16, episodes=2_000, minutes=5.0, evaluate_every=0),
     ),
     "cpu": _CPU,
     "paper": Config(),
+    "ppg": Config(
+        task=TaskConfig(robot="barrett", primitive="push_grasp"),
+        strokes=StrokesConfig(positives=5_000),
+        train=TrainConfig(method="imitation"),
+    ),
 }
 """`ci`: 2 scenes, a minute, for tests. `demo`: minutes, shows every part. `cpu`: two cores, 150 minutes.
-`paper`: width 1.0, 45 K episodes, as published."""
+`paper`: width 1.0, 45 K episodes, as published. `ppg`: a baseline of the paper, another hand and method."""
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -362,23 +519,48 @@ def from_dict(values: Mapping[str, Any], cls: type = Config, prefix: str = "") -
     unknown = sorted(set(values) - set(hints), key=str)
     if unknown:
         raise ValueError(f"unknown config key {prefix}{unknown[0]}; allowed here: {', '.join(sorted(hints))}")
-    fields = {}
-    for name, value in values.items():
-        if dataclasses.is_dataclass(hints[name]):
-            fields[name] = from_dict(value, typing.cast(type, hints[name]), f"{prefix}{name}.")
-        else:
-            fields[name] = _checked(value, hints[name], f"{prefix}{name}")
-    return cls(**fields)
+    required = [field.name for field in dataclasses.fields(cls) if _has_no_default(field)]
+    if missing := [name for name in required if name not in values]:
+        raise ValueError(f"config key {prefix}{missing[0]} is missing")
+    return cls(**{name: _read(value, hints[name], f"{prefix}{name}") for name, value in values.items()})
+
+
+def _has_no_default(field: dataclasses.Field[Any]) -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+
+
+def _read(value: Any, hint: Any, key: str) -> Any:
+    """Return a value as its type hint wants it: a dataclass, a tuple or a mapping of something, or a plain value."""
+    if hint is Any:
+        return value
+    if dataclasses.is_dataclass(hint):
+        return from_dict(value, typing.cast(type, hint), f"{key}.")
+    if typing.get_origin(hint) is tuple:
+        inner = typing.get_args(hint)
+        if not isinstance(value, list | tuple) or (inner[-1] is not Ellipsis and len(value) != len(inner)):
+            count = "" if inner[-1] is Ellipsis else f" of {len(inner)}"
+            raise ValueError(f"{key} = {value!r} has the wrong type; allowed: a list{count}")
+        return tuple(_read(item, inner[0], f"{key}[{index}]") for index, item in enumerate(value))
+    if typing.get_origin(hint) is dict:
+        if not isinstance(value, Mapping):
+            raise ValueError(f"{key} = {value!r} has the wrong type; allowed: a mapping")
+        return {name: _read(item, typing.get_args(hint)[1], f"{key}.{name}") for name, item in value.items()}
+    nested = [
+        option for option in typing.get_args(hint) if dataclasses.is_dataclass(option) or typing.get_origin(option)
+    ]
+    if len(nested) == 1 and isinstance(value, list | tuple | Mapping):
+        return _read(value, nested[0], key)
+    return _checked(value, hint, key)
 
 
 def _checked(value: Any, hint: Any, key: str) -> Any:
     """Return `value` if it is of type `hint` (an int passes for a float)."""
-    origin = typing.get_origin(hint)
-    if origin is Literal:
-        if value not in typing.get_args(hint):
-            raise ValueError(f"{key} = {value!r} is unknown; allowed: {', '.join(typing.get_args(hint))}")
+    allowed = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+    words = [word for option in allowed if typing.get_origin(option) is Literal for word in typing.get_args(option)]
+    if words and (value is not None or type(None) not in allowed):
+        if not isinstance(value, typing.Hashable) or value not in words:
+            raise ValueError(f"{key} = {value!r} is unknown; allowed: {', '.join(words)}")
         return value
-    allowed = typing.get_args(hint) if origin in (typing.Union, types.UnionType) else (hint,)
     if float in allowed and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(value) not in allowed:
@@ -388,21 +570,25 @@ def _checked(value: Any, hint: Any, key: str) -> Any:
 
 
 def with_absolute_paths(config: Config) -> Config:
-    """Return a config whose folders mean the same from any working directory."""
-    folder = config.assets.object_dir
-    if folder is None:
-        return config
-    return dataclasses.replace(config, assets=dataclasses.replace(config.assets, object_dir=os.path.abspath(folder)))
+    """Return a config whose folders and files mean the same from any working directory."""
+    folder, sensor = config.assets.object_dir, config.task.sensor
+    if folder is not None:
+        assets = dataclasses.replace(config.assets, object_dir=os.path.abspath(folder))
+        config = dataclasses.replace(config, assets=assets)
+    if sensor.endswith((".yaml", ".yml")):
+        config = dataclasses.replace(config, task=dataclasses.replace(config.task, sensor=os.path.abspath(sensor)))
+    return config
 
 
 def difference(old: Config, new: Config) -> list[str]:
     """Return one line ``key: old -> new`` for every setting in which two configs differ."""
-    flat_old, flat_new = _flatten(to_dict(old)), _flatten(to_dict(new))
+    flat_old, flat_new = flatten(to_dict(old)), flatten(to_dict(new))
     return [f"{key}: {flat_old[key]} -> {flat_new[key]}" for key in flat_old if flat_old[key] != flat_new[key]]
 
 
-def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested settings as one dict with keys such as ``task.r_out``."""
     flat = {}
     for key, value in values.items():
-        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
+        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
     return flat

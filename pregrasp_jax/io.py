@@ -1,6 +1,7 @@
 """Files that are whole or absent, and hashes that say what made them. No other module of the package is needed."""
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
@@ -127,6 +128,20 @@ def write_bytes(path: Path, data: bytes) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write `value` as indented JSON, whole or not at all."""
     write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
+
+
+def append_json_line(path: Path, value: Any) -> None:
+    """Append `value` as one line of JSON, whole or not at all.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    data = (json.dumps(value, allow_nan=False) + "\n").encode()
+    with path.open("ab", buffering=0) as file:
+        length = file.tell()
+        if file.write(data) < len(data):  # what a full disk does at first; only the next write raises
+            file.truncate(length)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), file.name)
 
 
 def write_npz(path: Path, **arrays: np.ndarray) -> None:

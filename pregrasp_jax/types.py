@@ -40,12 +40,19 @@ REASONS = (
     "obstacle_in_region",
     "no_action",
     "truncated",
+    "target_held",
+    "target_not_alone",
+    "obstacle_grasped",
 )
-"""Why an episode ended; an integer reason indexes this tuple, earlier entries win."""
+"""Why an episode ended; an integer reason indexes this tuple, earlier entries win. The last three are of strokes."""
 
-OBSTRUCTIONS = ("none", "no_ik", "joint_limit", "table", "wall", "too_long", "end_error")
+PUSH_REASONS = REASONS[: REASONS.index("truncated") + 1]
+"""Why episodes of pushes end: those that a training counts, and checkpoints hold the counts of."""
+
+OBSTRUCTIONS = ("none", "no_ik", "joint_limit", "table", "wall", "too_long", "end_error", "jammed")
 """What keeps a hand from where it is sent: no joint solution, a joint's limit of angle or speed, an arm link too near
-to the table or to a wall, a motion longer than was planned for, or (after the motion) a final error above 10 mm."""
+to the table or to a wall, a motion longer than was planned for; or, after the motion, a final error above 10 mm, or
+objects pressed into each other or into a wall."""
 
 
 class HandPose(struct.PyTreeNode):
@@ -126,6 +133,25 @@ class SceneParams(struct.PyTreeNode):
     target: jax.Array
 
 
+class Touch(struct.PyTreeNode):
+    """What a hand touched in a stroke: down, ahead, close, up.
+
+    Attributes:
+        collided: () bool, it touched something on its way down, and went no farther.
+        rows: () int32 control rows that it moved; 0 before the first stroke.
+        poses: [3, MAX_OBJECTS, 7] float32 of the objects before it pushed, before it closed, and at the end, when what
+            it has lifted is still in the hand.
+        contacts: [L, MAX_OBJECTS] bool, which links of the robot touch which slots at the end.
+        gone: [MAX_OBJECTS] bool, which objects were taken away after it.
+    """
+
+    collided: jax.Array
+    rows: jax.Array
+    poses: jax.Array
+    contacts: jax.Array
+    gone: jax.Array
+
+
 class PhysicsObservation(struct.PyTreeNode):
     """What comes out of an engine.
 
@@ -135,6 +161,7 @@ class PhysicsObservation(struct.PyTreeNode):
         hand_pose: [7] float32 pose of the grasp point frame (x forward, z up) in the world.
         diverged: () bool, what the engine holds makes no sense (see `physics.base`): NaN, too fast, too deep, fallen.
         overflows: () int32 physics steps since the reset in which the engine had no room for every contact.
+        touch: what the hand touched in its last stroke, of engines that tell (`physics.strokes`).
     """
 
     object_poses: jax.Array
@@ -142,6 +169,7 @@ class PhysicsObservation(struct.PyTreeNode):
     hand_pose: jax.Array
     diverged: jax.Array
     overflows: jax.Array
+    touch: Touch | None = None
 
 
 class Observation(struct.PyTreeNode):
@@ -197,11 +225,13 @@ class GraspResult(struct.PyTreeNode):
         held: () bool, the target was lifted and stayed between the fingers.
         diverged: () bool, as in `PhysicsObservation`.
         overflows: () int32, as in `PhysicsObservation`, the pushes before the grasp included.
+        obstruction: () int32 index into `OBSTRUCTIONS`, what kept it from being tried.
     """
 
     held: jax.Array
     diverged: jax.Array
     overflows: jax.Array
+    obstruction: jax.Array
 
 
 class EnvState(struct.PyTreeNode):
@@ -240,7 +270,7 @@ class StepResult(struct.PyTreeNode):
     """What `env.step` returns beside the next state.
 
     Attributes:
-        outcome: what the push did, per object.
+        outcome: what the push did, per object: an `Outcome`, or what else the rules measure.
         reward: () float32 for the scene's own target.
         terminated: () bool, the episode ended by itself.
         truncated: () bool, it ran out of pushes.
@@ -248,7 +278,7 @@ class StepResult(struct.PyTreeNode):
         seconds: () float32 s, how long the robot took; 0 for a push that was not executed.
     """
 
-    outcome: Outcome
+    outcome: Any
     reward: jax.Array
     terminated: jax.Array
     truncated: jax.Array

@@ -16,6 +16,7 @@ import numpy as np
 from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace, Choice
+from pregrasp_jax.spaces.workspace import TABLE, Workspace
 from pregrasp_jax.task.primitive import Plan, Primitive, Stroke, make_plan
 from pregrasp_jax.task.push import APERTURE_TIME, SETTLE_TIME
 from pregrasp_jax.task.rules import Rules, judging
@@ -113,6 +114,8 @@ class FakeEnv:
     bank: Any = field(default_factory=lambda: SimpleNamespace(names=("mug", "can", "box"), content_hash="hulls"))
     eligible: Any = field(default_factory=lambda: np.array([True, True, False]))
     engine: Any = field(default_factory=make_engine)
+    workspace: Workspace = TABLE
+    symmetric: bool = True
 
     @functools.cached_property
     def primitive(self) -> Primitive:
@@ -182,12 +185,12 @@ class FakeEnv:
     def plan_grasp(self, state: EnvState) -> Plan:
         return make_plan(jnp.zeros((1, 1)), jnp.int32(1), jnp.float32(1.0), jnp.int32(0), state.hand)
 
-    def conclude_grasp(self, state: EnvState, physics: Any) -> GraspResult:
+    def conclude_grasp(self, state: EnvState, plan: Plan, physics: Any) -> GraspResult:
         del physics
-        return GraspResult(state.scene_index % 2 == 0, jnp.bool_(False), jnp.int32(0))
+        return GraspResult(state.scene_index % 2 == 0, jnp.bool_(False), jnp.int32(0), plan.obstruction)
 
     def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> GraspResult:
-        result = self.conclude_grasp(state, state.physics)
+        result = self.conclude_grasp(state, self.plan_grasp(state), state.physics)
         return result.replace(held=result.held & execute)
 
     def _measure(self, before: EnvState, after: EnvState, plan: Plan) -> Outcome:

@@ -21,8 +21,8 @@ PROGRAMS = {"train": ["train"], "evaluate": ["evaluate"], "pregrasp_jax": []}
 """Arguments of the program that the first word of a line stands for."""
 
 COMMAND_LINES = [
-    ("train", "Expected one of {ci, demo, cpu, paper, resume}"),
-    ("train foo", "Unrecognized options: foo (Available subcommands: ci, demo, cpu, paper, resume)"),
+    ("train", "Expected one of {ci, demo, cpu, paper, ppg, resume}"),
+    ("train foo", "Unrecognized options: foo (Available subcommands: ci, demo, cpu, paper, ppg, resume)"),
     ("train ci", "Missing from", "--run-dir PATH"),
     ("train ci --run-dir {w}/new --physics.enginee mjx", "--physics.enginee, mjx (--physics.engine {native,mjx})"),
     ("train ci --run-dir {w}/new --physics.engine bullet", "Expected one of ('native', 'mjx')"),
@@ -49,8 +49,8 @@ COMMAND_LINES = [
     ),
     (
         "pregrasp_jax dokter",
-        "Unrecognized options: dokter (Available subcommands: assets, compare, demo, doctor, evaluate, ",
-        "scenes, show, train)",
+        "Unrecognized options: dokter (Available subcommands: assets, calibrate-check, compare, contract, ",
+        "scenes, show, sweep, train, verify)",
     ),
     ("pregrasp_jax demo --episodes 0 --run-dir {w}/new", "episodes = 0 is out of range; allowed is 1 and more"),
     ("pregrasp_jax show --pushes -1", "pushes = -1 is out of range; allowed is 0 and more"),

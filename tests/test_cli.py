@@ -197,6 +197,11 @@ def test_compare_prints_and_writes(run: Any, tmp_path: Path) -> None:
     assert "mine" in out and "only A 6, only B 1" in out and "p = 0.125" in out
     written = json.loads((tmp_path / "c.json").read_text())
     assert written["p_value"] == 0.125 and written["policies"] == ["mine", "clear"]
+    there = write_evaluation(tmp_path / "d.json", "clear", [0, 0, 0, 0, 0, 0, 1], workspace="shelf")
+    code, _, err = run("compare", str(a), str(there))
+    assert code == 2 and "workspace is table in the first file and shelf in the second" in err
+    code, out, _ = run("compare", str(a), str(there), "--across-workspaces", "True")
+    assert code == 0 and "differs in workspace: table | shelf" in out and "only A 6, only B 1" in out
 
 
 def test_doctor_names_what_a_bug_report_needs(run: Any) -> None:
@@ -305,6 +310,11 @@ def test_assets_lists_and_draws_a_folder(run: Any, tmp_path: Path, monkeypatch: 
     assert "carton" in out and "refused: millimetres.stl" in out
     image = np.asarray(Image.open(png))
     assert image.ndim == 3 and image.std() > 5
+    code, out, err = run("assets", str(meshes), "--variants", "2", "--png", str(png))
+    assert code == 0, err
+    assert "made_0001" in out and "2 objects" in out and "millimetres" not in out
+    code, _, err = run("assets", "--variants", "-1", "--png", str(png))
+    assert code == 2 and "assets.variants = -1 is out of range; allowed is 0 to 10000" in err
 
 
 def test_describe_scenes_counts() -> None:

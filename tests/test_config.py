@@ -1,6 +1,7 @@
 """Configurations survive a round trip, and what is wrong in one is said in one line."""
 
 import dataclasses
+import functools
 import typing
 
 import pytest
@@ -19,17 +20,20 @@ def test_presets_are_valid_and_survive_yaml(name, tmp_path):
     assert read_config(tmp_path / "config.yaml") == preset
 
 
+def numeric_fields(cls: type, prefix: str = "") -> set[str]:
+    """Return the keys of all numbers of a config and of the configs in it."""
+    found = set()
+    for name, hint in typing.get_type_hints(cls).items():
+        if dataclasses.is_dataclass(hint):
+            found |= numeric_fields(typing.cast(type, hint), f"{prefix}{name}.")
+        elif hint in (int, float, int | None, float | None):
+            found.add(prefix + name)
+    return found
+
+
 def test_every_number_has_a_range():
     """A new numeric field without a range would be accepted however absurd."""
-    hints = typing.get_type_hints(Config)
-    numeric = {name for name, hint in hints.items() if hint in (int, float)} | {
-        f"{stage}.{name}"
-        for stage, cls in hints.items()
-        if dataclasses.is_dataclass(cls)
-        for name, hint in typing.get_type_hints(cls).items()
-        if hint in (int, float, int | None)
-    }
-    assert numeric == set(config_module._RANGES)
+    assert numeric_fields(Config) == set(config_module._RANGES)
 
 
 @pytest.mark.parametrize("key", sorted(config_module._RANGES))
@@ -38,7 +42,7 @@ def test_a_value_beyond_its_range_is_refused(key):
     low, high = config_module._RANGES[key]
     for value in (low - 1, high + 1):
         values = to_dict(Config())
-        section = values[stage[0]] if stage else values
+        section = functools.reduce(lambda inner, part: inner[part], stage, values)
         section[name] = value if section[name] is None else type(section[name])(value)
         with pytest.raises(ValueError, match=rf"^{key} = .* is out of range; allowed is ") as error:
             from_dict(values).validate()
@@ -67,6 +71,11 @@ def test_what_is_wrong_is_named_with_what_is_allowed(values, said):
 def test_settings_that_contradict_each_other():
     with pytest.raises(ValueError, match=r"task.r_in = 0.3 must be below task.r_out = 0.2"):
         from_dict({"task": {"r_in": 0.3}}).validate()
+    with pytest.raises(ValueError, match=r"learner.siblings = True is about branches.* exploration.branches of 1"):
+        from_dict({"learner": {"siblings": True}}).validate()
+    with pytest.raises(ValueError, match=r"exploration.branch_spacing = 0.02 is about branches"):
+        from_dict({"exploration": {"branch_spacing": 0.02}}).validate()
+    from_dict({"learner": {"siblings": True}, "exploration": {"branches": 2, "branch_spacing": 0.02}}).validate()
     with pytest.raises(ValueError, match=r"scene.min_objects = 8 must not exceed scene.max_objects = 5"):
         from_dict({"scene": {"min_objects": 8, "max_objects": 5}}).validate()
 

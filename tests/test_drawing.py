@@ -97,11 +97,11 @@ def test_panel_draws_the_push_on_the_map_of_its_aperture():
     obs = Observation(height=blank, instance_ids=blank, hand=hand_at((-0.2, 0.0)))
     mask = np.zeros(ACTIONS.shape, bool)
     mask[40:60, 20:40] = True
-    action = int(ACTIONS.encode(jnp.int32(50), jnp.int32(35), jnp.int32(OPEN)))
+    taken = drawing.Taken(OPEN, (-0.2, 0.0), (-0.07, 0.0))
     tiles = functools.partial(drawing.make_tiles, hulls, obs, 0, actions=ACTIONS, mask=mask)
     for q_values in (None, np.random.default_rng(0).normal(size=(100, 100, 2))):
         with_push, without = (
-            drawing.make_panel(tiles(q_values=q_values, action=chosen), title="test") for chosen in (action, None)
+            drawing.make_panel(tiles(q_values=q_values, taken=chosen), title="test") for chosen in (taken, None)
         )
         assert with_push.shape == without.shape
         changed = np.nonzero((with_push != without).any(axis=(0, 2)))[0]
@@ -119,12 +119,13 @@ def test_of_many_choices_the_best_are_drawn_and_the_chosen_one_among_them():
     q_values = np.zeros(actions.shape)
     q_values[50, 50] = [0.3, 0.1, 0.9, 0.2, 0.8, 0.7, 5.0]  # the largest is not allowed
     tiles = functools.partial(drawing.make_tiles, hulls, obs, 0, actions=actions, mask=mask, q_values=q_values)
-    worst = int(actions.encode(jnp.int32(50), jnp.int32(60), jnp.int32(1)))
-    shown, chosen = ([caption for caption, _ in tiles(action=action)[3:]] for action in (None, worst))
+    worst = drawing.Taken(1, (-0.2, 0.0), (0.05, 0.0))
+    shown, chosen = ([caption for caption, _ in tiles(taken=taken)[3:]] for taken in (None, worst))
     names = [[int(caption.split()[2]) for caption in captions] for captions in (shown, chosen)]
     best = [2, 4, 5, 0, 3]
     assert names[0] == sorted(best[: len(names[0])]) and 1 < len(names[0]) < 7
     assert names[1] == sorted([1, *best[: len(names[0]) - 1]])
+    assert [caption for caption, _ in tiles(taken=worst, q_values=None)[3:]] == ["push held 1"], "no values, one map"
 
 
 def test_contact_sheet_shows_every_object():

@@ -18,6 +18,7 @@ from pregrasp_jax.config import Config, ExplorationConfig, SceneConfig, TaskConf
 from pregrasp_jax.spaces.workspace import Box, Workspace
 from pregrasp_jax.task import env as env_module
 from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.place import refuse_walls
 from pregrasp_jax.task.rules import make_rules
 from pregrasp_jax.types import MAX_OBJECTS, SceneParams
 
@@ -142,9 +143,9 @@ def test_settings_that_cannot_work_are_refused(monkeypatch):
 )
 def test_walls_in_the_way_are_refused(wall, said):
     fine = Box(center=(0.0, 0.6, 0.1), half_size=(0.4, 0.02, 0.1))
-    env_module.refuse_walls(ROBOT, Workspace(name="room", walls=(fine,)))
+    refuse_walls(ROBOT, Workspace(name="room", walls=(fine,)))
     with pytest.raises(ValueError, match=rf"workspace 'room': {said} m or more"):
-        env_module.refuse_walls(ROBOT, Workspace(name="room", walls=(fine, wall)))
+        refuse_walls(ROBOT, Workspace(name="room", walls=(fine, wall)))
 
 
 def test_objects_that_no_hand_can_take_are_refused():

@@ -18,6 +18,7 @@ from pregrasp_jax.evaluation import Episode, EvaluationResult, Evaluator, evalua
 from pregrasp_jax.policies import scripts
 from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.task.env import make_env
+from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.types import REASONS, EnvState, GraspResult, Observation
 
 ENV = fake_env()
@@ -51,9 +52,9 @@ def _reference(env: Any, policy: scripts.Policy, episodes: int, seed: int, with_
 class _Shaky(FakeEnv):
     """Grasps of odd scenes make no sense afterwards; in scene 2 contacts are dropped, and it holds."""
 
-    def conclude_grasp(self, state: EnvState, physics: Any) -> GraspResult:
+    def conclude_grasp(self, state: EnvState, plan: Plan, physics: Any) -> GraspResult:
         odd = state.scene_index % 2 == 1
-        return GraspResult(~odd, odd, jnp.where(state.scene_index == 2, 7, 0))
+        return GraspResult(~odd, odd, jnp.where(state.scene_index == 2, 7, 0), plan.obstruction)
 
 
 def test_what_happens_during_a_grasp_is_not_silent() -> None:
@@ -214,8 +215,24 @@ def _document(result: EvaluationResult = RESULT, policy: str = "clear") -> dict:
         seed=4,
         hull_bank_hash="h",
         scene_bank_hash="s",
+        workspace_hash="w",
         wall_seconds=12.34,
     )
+
+
+def test_an_attempt_may_be_two_motions_and_a_target_held_in_any_way() -> None:
+    """Strokes: two successes after 1 and 3 strokes with the way back, one target held with another object."""
+    kinds = {"motions_per_attempt": 2, "target": "can", "return_": 0.0, "seconds": 1.0}
+    episodes = [
+        Episode(scene=0, reason="target_held", success=True, motions=2, **kinds),
+        Episode(scene=1, reason="target_held", success=True, motions=6, **kinds),
+        Episode(scene=2, reason="target_not_alone", success=False, motions=4, **kinds),
+        Episode(scene=3, reason="truncated", success=False, motions=20, **kinds),
+    ]
+    summary = EvaluationResult(tuple(episodes)).summary()
+    assert (summary["mean_motions"], summary["mean_attempts"]) == (4.0, 2.0)
+    assert (summary["success_rate"], summary["lenient_rate"]) == (0.5, 0.75)
+    assert [episode.to_dict()["attempts"] for episode in episodes] == [1, 3, 2, 10]
 
 
 def test_summary_by_hand() -> None:
@@ -232,8 +249,10 @@ def test_summary_by_hand() -> None:
         "scene": 3,
         "target": "can",
         "reason": "off_table",
+        "obstruction": "none",
         "success": False,
         "motions": 3,
+        "attempts": 3,
         "return": 2.0,
         "seconds": 1.0,
     }
@@ -255,6 +274,20 @@ def test_document_says_what_was_run(tmp_path: Path) -> None:
     assert results.load_evaluation(path) == document
     text = results.format_evaluation(document)
     assert "40.0%" in text and "grasp_failed 2, off_table 1" in text and "3.50 +- 1.50" in text
+
+
+def test_what_was_in_the_way_is_counted_by_reason() -> None:
+    blocked = [("unreachable", "wall"), ("unreachable", "end_error"), ("unreachable", "wall"), ("grasp_failed", "wall")]
+    episodes = [
+        dataclasses.replace(_episode(scene, reason, 1), obstruction=obstruction)
+        for scene, (reason, obstruction) in enumerate([*blocked, ("grasp_failed", "none"), ("off_table", "none")])
+    ]
+    document = _document(EvaluationResult((*episodes, _episode(6, "target_in_region", 2))))
+    assert document["obstructions"] == {"unreachable": {"wall": 2, "end_error": 1}, "grasp_failed": {"wall": 1}}
+    assert [row["obstruction"] for row in document["rows"]][:2] == ["wall", "end_error"]
+    text = results.format_evaluation(document)
+    assert "unreachable 3 (wall 2, end_error 1), grasp_failed 2 (wall 1), off_table 1" in text
+    assert "table, native physics" in text, "where it was run"
 
 
 def test_nothing_succeeded() -> None:

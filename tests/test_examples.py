@@ -59,8 +59,8 @@ def test_an_own_place_has_a_wall_and_a_nearer_edge(tmp_path, capsys):
     module = load("own_place")
     picture = tmp_path / "place.png"
     results = module.main(scenes=2, num_envs=2, picture=picture)
-    assert [episode.scene for episode in results["narrow"].episodes] == [0, 1]
-    assert re.search(r"^narrow: \d+% of 2 scenes", capsys.readouterr().out, re.MULTILINE)
+    assert [episode.scene for episode in results["ledge"].episodes] == [0, 1]
+    assert re.search(r"^ledge: \d+% of 2 scenes", capsys.readouterr().out, re.MULTILINE)
     points = np.array([[0.0, -0.23, 0.1], [0.0, 0.26, 0.1]])
     assert [list(WORKSPACES[name].has_left(points)) for name in results] == [[False, True], [True, False]]
     pixels = np.asarray(Image.open(picture)).astype(int)

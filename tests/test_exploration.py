@@ -129,8 +129,8 @@ def test_linear_schedule(step, value):
 
 
 def test_the_warm_up_only_explores():
-    config = ExplorationConfig(epsilon_start=0.5, epsilon_end=0.1, epsilon_decay=100)
-    values = [float(epsilon_at(step, config, warmup=50)) for step in (0, 49, 50, 100)]
+    config = ExplorationConfig(epsilon_start=0.5, epsilon_end=0.1)
+    values = [float(epsilon_at(step, config, warmup=50, decay=100)) for step in (0, 49, 50, 100)]
     assert values == pytest.approx([1.0, 1.0, 0.3, 0.1])
 
 
@@ -191,3 +191,33 @@ def test_a_cell_is_drawn_among_those_that_the_choice_allows():
         row, col, choice = (np.asarray(x) for x in actions.unravel(flat))
         assert set(choice) == {0, 1, 2}
         np.testing.assert_array_equal(np.stack([row, col], axis=-1), cells[choice])
+
+
+def best_apart(q: np.ndarray, mask: np.ndarray, *, count: int, spacing: float) -> list[tuple[int, int, int]]:
+    found = exploration.best_apart(jnp.asarray(q), jnp.asarray(mask), ACTIONS, count=count, spacing=spacing)
+    row, col, choice = ACTIONS.unravel(np.asarray(found))
+    return [(int(r), int(c), int(k)) for r, c, k in zip(row, col, choice, strict=True)]
+
+
+def test_the_best_pushes_apart_against_a_plain_loop():
+    rng = np.random.default_rng(3)
+    q, mask = rng.normal(size=ACTIONS.shape).astype(np.float32), np.array(both(ring()))
+    expected: list[tuple[int, int, int]] = []
+    for flat in np.argsort(-np.where(mask, q, -np.inf), axis=None):
+        row, col, choice = (int(i) for i in np.unravel_index(flat, q.shape))
+        near = [(r, c) for r, c, k in expected if k == choice and 0.005 * np.hypot(r - row, c - col) < 0.02 - 1e-6]
+        if not near:
+            expected.append((row, col, choice))
+        if len(expected) == 12:
+            break
+    assert best_apart(q, mask, count=12, spacing=0.02) == expected
+    assert q[expected[0]] == q[mask].max()
+
+
+def test_pushes_apart_begin_anew_where_there_are_no_more():
+    mask = np.zeros(ACTIONS.shape, bool)
+    mask[50, 50:53, 0] = True
+    mask[50, 50, 1] = True
+    q = np.zeros(ACTIONS.shape, np.float32)
+    q[50, 51, 0], q[50, 50, 1], q[50, 53, 0] = 2.0, -1.0, 9.0
+    assert best_apart(q, mask, count=4, spacing=0.05) == [(50, 51, 0), (50, 50, 1), (50, 51, 0), (50, 50, 1)]

@@ -10,8 +10,8 @@ from pregrasp_jax.geometry import quat_from_yaw
 from pregrasp_jax.robot.base import ClosingRegion, Eligibility, first_obstruction, hand_pose_of
 from pregrasp_jax.robot.floating import JOINTS, make_floating_hand
 from pregrasp_jax.scene.spec import compile_spec, scene_spec
+from pregrasp_jax.spaces.motion import minimum_jerk
 from pregrasp_jax.spaces.workspace import TABLE, Box, Workspace
-from pregrasp_jax.task.primitive import minimum_jerk
 from pregrasp_jax.types import CTRL_DT, OBSTRUCTIONS
 
 GRIPPER = """
@@ -145,6 +145,9 @@ def test_refusals(robot):
     two = "<mujoco><worldbody><body name='a'/><body name='b'/></worldbody></mujoco>"
     with pytest.raises(ValueError, match="gripper holds 2 bodies; allowed is one"):
         make(two, ())
+    two_drives = GRIPPER.replace("</actuator>", '<position name="right" joint="right" kp="4"/></actuator>')
+    with pytest.raises(ValueError, match="actuators of hand gripper are left, right; allowed are right, left, in this"):
+        make(two_drives, ("right", "left"))
     ball = "<mujoco><worldbody><body name='a'><geom size='0.1'/></body></worldbody></mujoco>"
     with pytest.raises(ValueError, match="capsule or a box"):
         make(ball, ())

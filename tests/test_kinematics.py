@@ -1,6 +1,7 @@
 """Kinematics against MuJoCo's own, and the closed-form inverse against the forward."""
 
 import itertools
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -8,17 +9,19 @@ import mujoco
 import numpy as np
 import pytest
 
+from pregrasp_jax import geometry
 from pregrasp_jax.robot import description, get_robot, kinematics
 from pregrasp_jax.spaces.workspace import TABLE
 
 ROBOT = get_robot("ur5e_rg2")
+ARM = description.arm()
 NUM = 400
 BRANCHES = list(itertools.product((1, -1), repeat=3))
 
-forward = jax.jit(jax.vmap(kinematics.forward_kinematics))
-inverse = jax.jit(jax.vmap(kinematics.inverse_kinematics))
-hand_inverse = jax.jit(jax.vmap(kinematics.hand_inverse_kinematics))
-grasp_poses = jax.jit(jax.vmap(kinematics.grasp_pose))
+forward = jax.jit(jax.vmap(partial(kinematics.forward_kinematics, ARM)))
+inverse = jax.jit(jax.vmap(partial(kinematics.inverse_kinematics, ARM)))
+hand_inverse = jax.jit(jax.vmap(partial(kinematics.hand_inverse_kinematics, ARM)))
+grasp_poses = jax.jit(jax.vmap(partial(kinematics.grasp_pose, ARM)))
 
 
 def random_joints(seed=0):
@@ -46,7 +49,7 @@ def test_dh_parameters_are_the_makers():
 
 def test_forward_kinematics_at_zero_by_hand():
     # Stretched along -x of the base: the wrist's offsets add up sideways and downwards.
-    flange = np.asarray(kinematics.forward_kinematics(jnp.zeros(6)))[-1]
+    flange = np.asarray(kinematics.forward_kinematics(ARM, jnp.zeros(6)))[-1]
     np.testing.assert_allclose(flange[:3, 3], [-0.8172, -(0.1333 + 0.0996), 0.1625 - 0.0997], atol=1e-6)
     np.testing.assert_allclose(flange[:3, 2], [0, -1, 0], atol=1e-6)
 
@@ -71,7 +74,7 @@ def test_forward_of_inverse_is_the_identity(targets):
     if targets == "anywhere":
         wanted = np.asarray(forward(random_joints())[:, -1])
     else:
-        wanted = np.asarray(jax.vmap(kinematics.flange_from_hand_pose)(jnp.asarray(workspace_poses())))
+        wanted = np.asarray(jax.vmap(partial(kinematics.flange_from_hand_pose, ARM))(jnp.asarray(workspace_poses())))
     solutions = np.asarray(inverse(wanted))
     exists = np.asarray(np.isfinite(solutions).all(axis=-1))
     np.testing.assert_array_equal(np.isnan(solutions).all(axis=-1), ~exists)
@@ -129,7 +132,7 @@ def test_wrist_singularity_keeps_the_pose():
 def test_branches_are_unwrapped_one_by_one_and_missing_ones_stay_missing():
     reference = jnp.array([3.1, 0, 0, 0, 0, 0])
     solutions = jnp.full((8, 6), jnp.nan).at[3].set(jnp.array([-3.1, 0, 0, 0, 0, 0])).at[6].set(jnp.ones(6))
-    found = np.asarray(kinematics.unwrap_near(solutions, reference))
+    found = np.asarray(kinematics.unwrap_near(ARM, solutions, reference))
     np.testing.assert_allclose(found[3], [2 * np.pi - 3.1, 0, 0, 0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(found[6], np.ones(6), atol=1e-6)
     assert np.isnan(np.delete(found, [3, 6], axis=0)).all()
@@ -139,7 +142,7 @@ def test_a_path_keeps_the_branch_that_is_nearest_to_the_current_joints():
     """From every posture of the start pose a short path is followed without a jump, in that posture."""
     start = np.array([-0.3, 0.0, 0.1, 1, 0, 0, 0], np.float32)
     path = jnp.asarray(start + np.linspace(0, 0.02, 10)[:, None] * np.eye(7, dtype=np.float32)[0])
-    postures = np.asarray(kinematics.hand_inverse_kinematics(jnp.asarray(start)))
+    postures = np.asarray(kinematics.hand_inverse_kinematics(ARM, jnp.asarray(start)))
     follow = jax.jit(lambda joints: ROBOT.follow(joints, path, jnp.zeros(10), TABLE)[0])
     followed = 0
     for posture in postures[np.isfinite(postures).all(axis=1)]:
@@ -153,7 +156,7 @@ def test_a_path_keeps_the_branch_that_is_nearest_to_the_current_joints():
 def test_unwrapping_respects_the_limits():
     # The elbow turns by half a turn only, so a whole turn more is never allowed; joint 0 may.
     joints = jnp.array([-3.0, 0, -3.0, 0, 0, 0])
-    found = np.asarray(kinematics.unwrap_near(joints, jnp.array([3.0, 0, 3.0, 0, 0, 0])))
+    found = np.asarray(kinematics.unwrap_near(ARM, joints, jnp.array([3.0, 0, 3.0, 0, 0, 0])))
     np.testing.assert_allclose(found, [2 * np.pi - 3, 0, -3, 0, 0, 0], atol=1e-6)
 
 
@@ -161,5 +164,5 @@ def test_unwrapping_respects_the_limits():
 @pytest.mark.parametrize("angle", [0.0, 1e-3, 1.5, 3.14159])
 def test_matrix_to_pose(axis, angle):
     quat = np.array([np.cos(angle / 2), *(np.sin(angle / 2) * np.array(axis))])
-    pose = np.asarray(kinematics.matrix_to_pose(jnp.asarray(description.pose_to_matrix(np.array([1, 2, 3]), quat))))
+    pose = np.asarray(geometry.matrix_to_pose(jnp.asarray(description.pose_to_matrix(np.array([1, 2, 3]), quat))))
     np.testing.assert_allclose(pose, [1, 2, 3, *quat], atol=1e-6)

@@ -10,7 +10,7 @@ from fake_env import hand_at
 
 from pregrasp_jax.config import LearnerConfig
 from pregrasp_jax.learning import learner
-from pregrasp_jax.learning.replay import Batch
+from pregrasp_jax.learning.replay import UNKNOWN, Batch
 from pregrasp_jax.types import REASONS, HandPose
 
 H, W = 2, 3
@@ -115,16 +115,21 @@ def make_batch(states, next_states, **changes) -> Batch:
     fields = {
         "inputs": state_input(states),
         "next_inputs": state_input(next_states),
+        "next_hand": hands([(0.0, 0.0)] * size),
+        "importance_weights": jnp.ones(size),
+        "hindsight": jnp.zeros(size, bool),
+    }
+    pushes = {
+        "rows": jnp.arange(size),
+        "drawn": jnp.ones(size, bool),
+        "next_values": jnp.full(size, UNKNOWN),
         "action": jnp.zeros(size, jnp.int32),
         "reward": jnp.zeros(size),
         "terminated": jnp.zeros(size, bool),
         "reason": jnp.zeros(size, jnp.int32),
-        "next_hand": hands([(0.0, 0.0)] * size),
-        "importance_weights": jnp.ones(size),
-        "hindsight": jnp.zeros(size, bool),
-        "rows": jnp.arange(size),
     }
-    return Batch(**(fields | changes))
+    given = {name: changes.pop(name, values).reshape(size, -1) for name, values in pushes.items()}
+    return Batch(**(fields | given | changes))
 
 
 def hands(points) -> HandPose:
@@ -158,9 +163,10 @@ def test_update_by_hand(compiled):
         hindsight=jnp.array([True, False, False]),
     )
     function = jax.jit(run_update) if compiled else run_update
-    state, errors, metrics = function(params, batch)
+    state, errors, values, metrics = function(params, batch)
+    np.testing.assert_allclose(values[:, 0], [90.0, 3 * 3.0, 0.0])
     # y = .5 + .5 * max(row 0 of 10 Q = 90), 2, 0 (empty ring); Q taken = 9, 10 * -2, -1.
-    np.testing.assert_allclose(errors, [9.0 - 45.5, -20.0 - 2.0, -1.0], rtol=1e-6)
+    np.testing.assert_allclose(errors[:, 0], [9.0 - 45.5, -20.0 - 2.0, -1.0], rtol=1e-6)
     expected = np.array(params)
     # Slope -0.1 each (linear branch), times weight, over the batch size; sgd with step 1 adds it.
     for index, weight in zip([(0, 0, 1, 1), (1, 1, 2, 0), (2, 0, 0, 0)], [1.0, 0.5, 0.25], strict=True):
@@ -180,17 +186,43 @@ def test_update_by_hand(compiled):
     np.testing.assert_allclose(shares, [1 / 3] * 4, rtol=1e-6)
 
 
+def test_siblings_share_a_state_and_keep_the_values_they_had():
+    """Three pushes of state 0: the one that was drawn, one whose next state had the value 6, and two to be left out."""
+    batch = make_batch(
+        [0],
+        [1],
+        drawn=jnp.array([[False, True, False, False]]),
+        next_values=jnp.array([[6.0, 1e6, UNKNOWN, UNKNOWN]]),
+        action=jnp.array([[0, 3, 5, 5]], jnp.int32),
+        reward=jnp.array([[0.5, 0.0, 1e6, 1e6]]),
+        terminated=jnp.zeros((1, 4), bool),
+        reason=jnp.zeros((1, 4), jnp.int32),
+        rows=jnp.array([[7, 8, 9, -1]]),
+        importance_weights=jnp.array([0.5]),
+    )
+    params = jnp.stack([Q, 10 * Q])
+    state, errors, values, metrics = run_update(params, batch)
+    np.testing.assert_allclose(values, [[6.0, 90.0, UNKNOWN, UNKNOWN]])
+    np.testing.assert_allclose(errors, [[1.0 - 3.5, 9.0 - 45.0, 0.0, 0.0]])
+    expected = np.array(params)
+    expected[0, 0, 0, 0] += 0.1 * 0.5 / 2
+    expected[0, 0, 1, 1] += 0.1 * 0.5 / 2
+    np.testing.assert_allclose(state.params, expected, rtol=1e-6)
+    assert float(metrics["train/target_mean"]) == pytest.approx((3.5 + 45.0) / 2)
+    assert float(metrics["train/target_max"]) == 45.0
+
+
 def test_targets_come_from_the_target_network():
     optimizer = optax.sgd(0.0)
     state = learner.init(jnp.zeros((1, H, W, 2)), optimizer).replace(target_params=Q[None])
     options = OPTIONS | {"q": table(), "mask_fn": first_row, "optimizer": optimizer}
-    _, errors, _ = learner.update(state, make_batch([0], [0]), **options)
-    assert float(errors[0]) == -4.5
+    _, errors, _, _ = learner.update(state, make_batch([0], [0]), **options)
+    assert float(errors[0, 0]) == -4.5
 
 
 def test_adam_and_polyak_are_what_the_paper_names():
     batch = make_batch([0], [0], reward=jnp.array([100.0]))
-    state, _, _ = run_update(jnp.zeros((1, H, W, 2)), batch, optax.adam(1e-4))
+    state, *_ = run_update(jnp.zeros((1, H, W, 2)), batch, optax.adam(1e-4))
     assert float(state.params[0, 0, 0, 0]) == pytest.approx(1e-4, rel=1e-3)
     assert float(state.target_params[0, 0, 0, 0]) == pytest.approx(1e-7, rel=1e-3)
     assert int(jnp.sum(state.params != 0)) == 1
@@ -204,8 +236,8 @@ def test_init_copies_so_that_a_donated_state_stays_valid():
         lambda s, b: learner.update(s, b, q=table(), mask_fn=first_row, optimizer=optimizer, **OPTIONS),
         donate_argnums=0,
     )
-    state, _, _ = step(state, make_batch([0], [0]))
-    state, _, _ = step(state, make_batch([0], [0]))
+    state, *_ = step(state, make_batch([0], [0]))
+    state, *_ = step(state, make_batch([0], [0]))
     assert int(state.gradient_steps) == 2
 
 
@@ -225,10 +257,10 @@ def test_one_trace():
     options = OPTIONS | {"q": q, "mask_fn": first_row, "optimizer": optimizer}
     step = jax.jit(lambda s, b: learner.update(s, b, **options))
     state = learner.init(jnp.zeros((2, H, W, 2)), optimizer)
-    state, _, _ = step(state, make_batch([0, 1], [1, 0]))
+    state, *_ = step(state, make_batch([0, 1], [1, 0]))
     num_traces = len(traces)
     for _ in range(3):
-        state, _, _ = step(state, make_batch([1, 1], [0, 0]))
+        state, *_ = step(state, make_batch([1, 1], [0, 0]))
     assert len(traces) == num_traces == 2
 
 

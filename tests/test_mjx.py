@@ -190,6 +190,12 @@ def test_one_trace_serves_all_objects(pushed):
     assert len(pushed[1]) == 1
 
 
+def test_a_scene_may_start_in_the_mirror_image_of_the_arm(bank, engine):
+    starts = [engine.observe(engine.reset(engine.init(), row_of(bank, (0, 1)), mirrored)) for mirrored in (False, True)]
+    np.testing.assert_allclose([seen.joint_pos for seen in starts], ROBOT.homes, atol=1e-6)
+    np.testing.assert_array_equal(starts[0].object_poses, starts[1].object_poses)
+
+
 def test_a_scene_with_more_objects_than_slots_is_marked(bank, engine):
     scene = row_of(bank, (0, 1, 2))
     assert not engine.observe(engine.reset(engine.init(), scene)).diverged

@@ -45,6 +45,7 @@ class Training(NamedTuple):
     """
 
     iterate: Any
+    pace: Any
     host_calls: list[str]
     traces: list[int]
     before: program.TrainState
@@ -77,7 +78,7 @@ def host_calls(built: program.Program, *platforms: str) -> list[str]:
     # Without weak types, as `compile` does: the trace of a push is then that of `shapes`.
     state = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), built.shapes())
     due = (jax.ShapeDtypeStruct((2,), dtype) for dtype in (jnp.int32, jnp.float32))
-    traced = jax.jit(program.make_iterate(built), donate_argnums=0).trace(state, *due)
+    traced = jax.jit(program.make_iterate(built), donate_argnums=0).trace(state, *due, built.pace)
     text = traced.lower(lowering_platforms=platforms).as_text()
     assert len(re.findall(r"stablehlo\.while", text)) > 1, "the loops over iterations and physics steps are in it"
     return re.findall(r"custom_call @\w*callback\w*|stablehlo\.(?:send|recv)\b", text)
@@ -91,10 +92,10 @@ def training() -> Training:
     iterate = built.compile(before).iterate
     assert iterate is not None
     donated = jax.tree.map(jnp.copy, before)
-    after = iterate(donated, np.array([0, 2], np.int32), np.full(2, 0.4, np.float32))
+    after = iterate(donated, np.array([0, 2], np.int32), np.full(2, 0.4, np.float32), built.pace)
     assert donated.actors.env_states.physics.qpos.is_deleted()
     assert donated.learning.replay.observations.height.is_deleted()
-    return Training(iterate, host_calls(built, "cuda", "tpu"), traces, before, after)
+    return Training(iterate, built.pace, host_calls(built, "cuda", "tpu"), traces, before, after)
 
 
 def test_two_iterations_push_remember_and_update(training):
@@ -115,7 +116,8 @@ def test_a_scene_that_diverges_ends_alone_is_counted_and_starts_anew(training):
     states = training.before.actors.env_states
     broken = states.replace(physics=states.physics.replace(qpos=states.physics.qpos.at[0, -1].set(jnp.nan)))
     state = training.before.replace(actors=training.before.actors.replace(env_states=broken))
-    after = training.iterate(jax.tree.map(jnp.copy, state), np.zeros(2, np.int32), np.zeros(2, np.float32))
+    idle = np.zeros(2, np.int32), np.zeros(2, np.float32), training.pace
+    after = training.iterate(jax.tree.map(jnp.copy, state), *idle)
     report = collect.metrics(after.actors.tally, SUCCESSES)
     assert report["reasons/nan"] == 1 and report["physics/diverged"] == 1 and report["episodes"] >= 1
     kept, before = after.actors.mishap, state.actors.env_states.physics
@@ -159,7 +161,7 @@ def test_twenty_pushes_on_four_packed_scenes_with_automatic_resets(full_env):
     actors, params = state.actors, state.learning.learner.params
     sizes = []
     for _ in range(20):
-        actors, _ = push(actors, params)
+        actors, _ = push(actors, params, built.pace)
         sizes.append(sum(x.nbytes for x in jax.live_arrays()))
     report = collect.metrics(actors.tally, SUCCESSES)
     assert report["env_steps"] == 80 and report["episodes"] > 4

@@ -14,8 +14,9 @@ from pregrasp_jax.robot import get_robot
 from pregrasp_jax.robot.ur5e_rg2 import FINGER_OPEN
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses
+from pregrasp_jax.spaces.motion import minimum_jerk
 from pregrasp_jax.spaces.workspace import TABLE
-from pregrasp_jax.task.primitive import Stroke, minimum_jerk
+from pregrasp_jax.task.primitive import Stroke
 from pregrasp_jax.task.push import num_push_rows, plan_push
 from pregrasp_jax.types import CTRL_DT, SceneParams
 
@@ -200,3 +201,16 @@ def test_float32_is_widened_to_the_bits_of_float64():
 def test_controls_of_another_robot_are_refused(engine):
     with pytest.raises(ValueError, match="ctrl must have 7 columns for robot ur5e_rg2, got 6"):
         engine.run(engine.init(), jnp.zeros((3, 6)), jnp.int32(3))
+
+
+def test_a_scene_may_start_in_the_mirror_image_of_the_arm(engine, scenes):
+    """Under `vmap`, beside one that does not; in it the arm can push as well."""
+    scene = packed_scene(scenes, 0)
+    starts = jax.jit(jax.vmap(lambda mirrored: engine.reset(engine.init(), scene, mirrored)))(jnp.array([False, True]))
+    seen = jax.vmap(engine.observe)(starts)
+    np.testing.assert_allclose(seen.joint_pos, ROBOT.homes, atol=1e-6)
+    np.testing.assert_array_equal(seen.object_poses[1], scene.poses)
+    np.testing.assert_allclose(seen.hand_pose[1], seen.hand_pose[0], atol=1e-5)
+    empty = engine.reset(engine.init(), empty_scene(), True)
+    hand = engine.observe(jax.jit(lambda s: push(engine, s, START, (-0.15, 0.0)))(empty)).hand_pose
+    np.testing.assert_allclose(hand[:3], [-0.15, 0.0, PUSH_HEIGHT], atol=5e-4)

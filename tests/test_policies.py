@@ -186,7 +186,7 @@ class _Slippery(FakeEnv):
     """Only an episode's second push leaves the target where it can be held."""
 
     def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> GraspResult:
-        return GraspResult((state.num_pushes == 2) & execute, jnp.bool_(False), jnp.int32(0))
+        return GraspResult((state.num_pushes == 2) & execute, jnp.bool_(False), jnp.int32(0), jnp.int32(0))
 
 
 def test_lookahead_prefers_a_candidate_whose_grasp_holds(key: jax.Array) -> None:

@@ -173,3 +173,26 @@ def test_rare_reward_is_found_by_priority(key):
     assert abs(float(prioritized[0, 0, 1]) - 2.0) < 0.1
     assert abs(float(uniform[0, 0, 1]) - 2.0) > 0.5
     assert float(jnp.mean(metrics["train/share_success"])) > 0.05
+
+
+def test_siblings_learn_the_same_values_with_the_next_states_looked_at_now_and_then(key):
+    """A chain 0 -> 1 -> success; from both states a branch is pushed too, to state 2, which is worth 2, and to failure.
+
+    Q(0) = [gamma 2, gamma 2], Q(1) = [2, 0], Q(2) = [2, 0]; the decoy is a stale value that is never looked at again.
+    """
+
+    def state(real, branch):
+        pair = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), real, branch)
+        return pair.replace(root=jnp.zeros(2, jnp.int32), truncated=pair.truncated | jnp.array([False, True]))
+
+    pushes = [
+        state(push(0, 0, 1), push(0, 1, 2)),
+        state(push(1, 0, 3, enclosed=0), push(1, 1, 3, enclosed=5)),
+        state(push(2, 0, 3, enclosed=0), push(2, 1, 3, enclosed=5)),
+    ]
+    memory = replay.init(pushes[0], capacity=64, max_pushes=10, num_siblings=2)
+    for step in pushes:
+        memory = add(memory, step)
+    q, metrics = train(memory, table(4), key, num_updates=500)
+    np.testing.assert_allclose(q[:3, 0], [[1.0, 1.0], [2.0, 0.0], [2.0, 0.0]], atol=0.02)
+    assert float(metrics["train/td_error"][-1]) < 0.02

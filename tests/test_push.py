@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pregrasp_jax.robot import get_robot, kinematics
+from pregrasp_jax.robot import description, get_robot, kinematics
 from pregrasp_jax.robot.base import hand_pose_of
 from pregrasp_jax.robot.ur5e_rg2 import FINGER_CLOSED, FINGER_OPEN
-from pregrasp_jax.spaces import grid
+from pregrasp_jax.spaces import grid, motion
 from pregrasp_jax.spaces.workspace import TABLE
-from pregrasp_jax.task import primitive, push
+from pregrasp_jax.task import push
 from pregrasp_jax.task.primitive import Stroke
 from pregrasp_jax.types import CTRL_DT, OBSTRUCTIONS
 
@@ -60,8 +60,8 @@ def test_half_ring_is_mirror_symmetric():
 
 
 def test_minimum_jerk_meets_its_boundary_conditions():
-    np.testing.assert_allclose(primitive.minimum_jerk(jnp.array([-1.0, 0.0, 0.5, 1.0, 2.0])), [0, 0, 0.5, 1, 1])
-    velocity = jax.vmap(jax.grad(primitive.minimum_jerk))(jnp.array([1e-3, 0.5, 1 - 1e-3]))
+    np.testing.assert_allclose(motion.minimum_jerk(jnp.array([-1.0, 0.0, 0.5, 1.0, 2.0])), [0, 0, 0.5, 1, 1])
+    velocity = jax.vmap(jax.grad(motion.minimum_jerk))(jnp.array([1e-3, 0.5, 1 - 1e-3]))
     np.testing.assert_allclose(velocity, [0, 1.875, 0], atol=1e-4)
 
 
@@ -80,7 +80,9 @@ def test_push_times_and_fingers():
 def test_plan_ends_at_p2():
     path = plan((-0.3, 0.0), (-0.2, 0.11))
     assert path.reachable
-    hand = jax.vmap(kinematics.grasp_pose)(path.ctrl[int(path.num_ctrl) - 5 : int(path.num_ctrl), :6])
+    hand = jax.vmap(functools.partial(kinematics.grasp_pose, description.arm()))(
+        path.ctrl[int(path.num_ctrl) - 5 : int(path.num_ctrl), :6]
+    )
     np.testing.assert_allclose(hand[:, :3], np.tile([-0.2, 0.11, 0.1], (5, 1)), atol=1e-4)
 
 
@@ -128,7 +130,7 @@ def test_a_push_that_is_refused_says_why_and_executes_nothing():
 def test_the_hand_turns_the_shorter_way_and_changes_its_height_on_the_way():
     found = plan((-0.3, 0.0), (-0.2, 0.05), yaw=0.4, z=0.15)
     assert found.reachable
-    hand = jax.vmap(kinematics.grasp_pose)(found.ctrl[:, :6])
+    hand = jax.vmap(functools.partial(kinematics.grasp_pose, description.arm()))(found.ctrl[:, :6])
     np.testing.assert_allclose(hand[0, :3], [-0.3, 0.0, 0.1], atol=1e-4)
     np.testing.assert_allclose(hand[-1], [-0.2, 0.05, 0.15, math.cos(0.2), 0, 0, math.sin(0.2)], atol=1e-4)
     around = plan((-0.3, 0.0), (-0.2, 0.05), yaw=0.4 - 2 * math.pi, z=0.15)

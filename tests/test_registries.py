@@ -20,9 +20,9 @@ def test_a_robot_is_made_once(monkeypatch):
 
 def test_unknown_names_are_refused_in_one_line():
     robot = get_robot("ur5e_rg2")
-    with pytest.raises(ValueError, match=r"task\.robot = 'arm' does not exist; allowed: ur5e_rg2$"):
+    with pytest.raises(ValueError, match=r"task\.robot = 'arm' does not exist; allowed: barrett, ur5e_rg2$"):
         get_robot("arm")
-    with pytest.raises(ValueError, match=r"task\.primitive = 'pull' does not exist; allowed: push$"):
+    with pytest.raises(ValueError, match=r"task\.primitive = 'pull' does not exist; allowed: push, push_grasp$"):
         get_kind("pull")
     with pytest.raises(ValueError, match=r"physics\.engine = 'bullet' does not exist; allowed: native, mjx$"):
         make_engine("bullet", None, robot, TABLE)  # pyright: ignore[reportArgumentType]

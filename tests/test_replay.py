@@ -261,16 +261,16 @@ def test_sampled_batches_are_aligned_after_wrap_around(key):
         obs, goal = decode_input(batch.inputs)
         next_obs, next_goal = decode_input(batch.next_inputs)
         np.testing.assert_array_equal(goal, next_goal)
-        np.testing.assert_array_equal(goal, np.asarray(memory.rows.goal)[batch.rows])
+        np.testing.assert_array_equal(goal, np.asarray(memory.rows.goal)[batch.rows[:, 0]])
         for i, obs_id in enumerate(obs):
             origin = by_obs[obs_id]
-            assert next_obs[i] == origin["next_obs"] and int(batch.action[i]) == origin["action"]
+            assert next_obs[i] == origin["next_obs"] and int(batch.action[i, 0]) == origin["action"]
             if not batch.hindsight[i]:
-                assert (goal[i], float(batch.reward[i])) == (origin["goal"], origin["reward"])
-                assert bool(batch.terminated[i]) == origin["terminated"]
-                assert int(batch.reason[i]) == origin["reason"]
-            elif batch.terminated[i]:
-                assert REASONS[int(batch.reason[i])] == "target_in_region"
+                assert (goal[i], float(batch.reward[i, 0])) == (origin["goal"], origin["reward"])
+                assert bool(batch.terminated[i, 0]) == origin["terminated"]
+                assert int(batch.reason[i, 0]) == origin["reason"]
+            elif batch.terminated[i, 0]:
+                assert REASONS[int(batch.reason[i, 0])] == "target_in_region"
         np.testing.assert_array_equal(batch.next_hand.xy, np.stack([next_obs, -next_obs], axis=-1))
 
 
@@ -298,13 +298,13 @@ def test_sampling_follows_priorities_and_weights_undo_it(key):
     errors = jnp.linspace(0.1, 3.0, 12)
     memory = set_priorities(memory, jnp.arange(12), errors)
     batches = [sample(memory, k, importance_exponent=0.7) for k in jax.random.split(key, 60)]
-    drawn = np.concatenate([batch.rows for batch in batches])
+    drawn = np.concatenate([batch.rows[:, 0] for batch in batches])
     priority = (np.asarray(errors) + replay.MIN_TD_ERROR) ** 0.6
     probability = priority / priority.sum()
     np.testing.assert_allclose(np.bincount(drawn, minlength=12) / len(drawn), probability, atol=0.02)
     weights = (1 / (12 * probability)) ** 0.7
     for batch in batches[:5]:
-        expected = weights[batch.rows] / weights[batch.rows].max()
+        expected = weights[batch.rows[:, 0]] / weights[batch.rows].max()
         np.testing.assert_allclose(batch.importance_weights, expected, rtol=1e-5)
         assert float(batch.importance_weights.max()) == 1.0
 
@@ -322,7 +322,7 @@ def test_a_diverged_push_is_recorded_but_never_sampled(key):
     steps = steps.replace(outcome=steps.outcome.replace(diverged=diverged), terminated=diverged)
     memory = add(empty(capacity=30), steps)
     np.testing.assert_array_equal(memory.priorities.leaves[:4], [1, 0, 1, 0])
-    assert set(np.asarray(sample(memory, key, importance_exponent=1.0).rows)) == {0, 2}
+    assert set(np.asarray(sample(memory, key, importance_exponent=1.0).rows).ravel()) == {0, 2}
 
 
 def test_counters():
@@ -361,3 +361,90 @@ def test_a_capacity_that_an_episode_could_outlive_is_refused():
         empty(smallest - 1)
     shapes = jax.eval_shape(World(0).step)
     assert replay.init(shapes, capacity=smallest, max_pushes=MAX_PUSHES).observations.height.shape == (smallest, 1, 2)
+
+
+def branched(world: World, branches: int, diverged: bool = False) -> replay.Steps:
+    """One push of every scene and its branches: other actions, rewards and ends from the same observations."""
+    steps = world.step()
+    rows = [steps]
+    for k in range(1, branches + 1):
+        ends = np.array([world.new_id() for _ in range(NUM_ENVS)])
+        gone = jnp.full(NUM_ENVS, diverged and k == branches)
+        rows.append(
+            steps.replace(
+                action=steps.action + k,
+                reward=steps.reward + 1000 * k,
+                terminated=jnp.full(NUM_ENVS, k == 1),
+                truncated=jnp.full(NUM_ENVS, k != 1),
+                next_obs=image(ends),
+                outcome=steps.outcome.replace(diverged=gone),
+            )
+        )
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *rows)
+
+
+def with_siblings(branches: int, steps: int, *, diverged: bool = False) -> replay.Replay:
+    world, width = World(3, enclose=0.3), branches + 1
+    first = branched(World(0), branches)
+    memory = replay.init(first, capacity=120, max_pushes=MAX_PUSHES, num_siblings=width)
+    for _ in range(steps):
+        memory = add(memory, branched(world, branches, diverged))
+        memory = add_hindsight(memory, jnp.ones((NUM_ENVS * width, MAX_OBJECTS), bool))
+    return memory
+
+
+@pytest.mark.parametrize("steps", [3, 40])
+def test_siblings_are_the_pushes_from_the_same_observation(key, steps):
+    memory = with_siblings(2, steps)
+    batch = sample(memory, key, importance_exponent=0.5)
+    obs, _ = decode_input(batch.inputs)
+    rows, hidden = np.asarray(batch.rows), np.asarray(batch.hindsight)
+    assert (~hidden).sum() > 10
+    for i in range(len(obs)):
+        same = np.asarray(memory.rows.obs_slot)[rows[i][rows[i] >= 0]]
+        np.testing.assert_array_equal(same, same[0])
+        if hidden[i]:
+            np.testing.assert_array_equal(rows[i] >= 0, [True, False, False])
+            assert batch.drawn[i, 0]
+            continue
+        assert np.asarray(batch.drawn[i]).sum() == 1
+        np.testing.assert_array_equal(batch.action[i], obs[i] % math.prod(ACTIONS.shape) + np.arange(3))
+        np.testing.assert_array_equal(batch.reward[i], obs[i] / 2 + 1000 * np.arange(3))
+        np.testing.assert_array_equal(np.asarray(batch.terminated[i])[1:], [True, False])
+        assert batch.next_values[i, 1] == 0.0 and batch.next_values[i, 2] == replay.UNKNOWN
+
+
+def test_a_sibling_that_diverged_is_left_out(key):
+    batch = sample(with_siblings(2, 3, diverged=True), key, importance_exponent=0.5)
+    real = ~np.asarray(batch.hindsight)
+    assert (np.asarray(batch.rows)[real, 2] == -1).all() and (np.asarray(batch.rows)[real, 1] >= 0).all()
+
+
+def test_what_is_known_after_an_update_stays_with_the_rows(key):
+    memory = with_siblings(2, 3)
+    batch = sample(memory, key, importance_exponent=0.5)
+    values = jnp.where(batch.drawn, 100.0 + batch.rows, batch.next_values)
+    errors = jnp.where(values > replay.UNKNOWN, 2.0, 77.0)
+    after = jax.jit(functools.partial(replay.learned, priority_exponent=1.0))(memory, batch, errors, values)
+    drawn = np.unique(np.asarray(batch.rows)[np.asarray(batch.drawn)])
+    others = np.setdiff1d(np.arange(len(memory.rows.next_value)), drawn)
+    np.testing.assert_array_equal(after.rows.next_value[drawn], 100.0 + drawn)
+    np.testing.assert_array_equal(after.rows.next_value[others], memory.rows.next_value[others])
+    known = np.unique(np.asarray(batch.rows)[np.asarray((values > replay.UNKNOWN) & (batch.rows >= 0))])
+    np.testing.assert_allclose(after.priorities.leaves[known], 2.0 + replay.MIN_TD_ERROR)
+    rest = np.setdiff1d(np.arange(len(memory.rows.next_value)), known)
+    np.testing.assert_array_equal(after.priorities.leaves[rest], memory.priorities.leaves[rest])
+
+
+def test_a_state_is_weighed_by_how_often_any_of_its_pushes_is_drawn(key):
+    memory = with_siblings(2, 2)
+    memory = set_priorities(memory, jnp.arange(18), jnp.linspace(0.1, 3.0, 18))
+    batches = [sample(memory, k, importance_exponent=1.0) for k in jax.random.split(key, 40)]
+    first = np.concatenate([batch.rows[:, 0] for batch in batches])
+    weights = np.concatenate([batch.importance_weights for batch in batches])
+    for batch in batches[:1]:
+        assert float(batch.importance_weights.max()) == 1.0
+    states, counts = np.unique(first, return_counts=True)
+    mean = np.array([weights[first == state].mean() for state in states])
+    # Rare states weigh more, in proportion: each counts as much as the others in the end.
+    np.testing.assert_allclose(counts * mean / (counts * mean).mean(), 1.0, atol=0.15)

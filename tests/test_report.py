@@ -4,12 +4,12 @@ import re
 from pathlib import Path
 
 import pytest
-from report_files import ROWS, evaluation_row, run_main, write_evaluation, write_run
+from report_files import ROWS, evaluation_row, log_row, run_main, write_evaluation, write_run
 
 from pregrasp_jax.config import PRESETS, to_dict
 from pregrasp_jax.report import build_page, load_evaluations, read_run
 from pregrasp_jax.report.charts import duration, failure_figures, learning_figures, time_figures
-from pregrasp_jax.report.results import BASELINES, missing
+from pregrasp_jax.report.results import SCRIPTS, missing
 
 
 @pytest.fixture
@@ -32,15 +32,31 @@ def test_the_table_shows_the_numbers_of_the_files(run_dir: Path) -> None:
     other.write_text(other.read_text().replace("2.34567", "null").replace('"std_motions": 0.5', '"std_motions": null'))
     run = read_run(run_dir)
     cells = _texts(build_page(run, load_evaluations(run)))
-    table = cells[: cells.index("this run minus it") + 1 + 3 * 9]
-    own, chance, clear = table[9:18], table[18:27], table[27:36]
+    table = cells[: cells.index("this run minus it") + 1 + 3 * 10]
+    own, chance, clear = table[10:20], table[20:30], table[30:40]
     assert own == [
-        *("this run (elsewhere/first)", "seen", "orthographic", "8", "75 %", "12.3 % to 87.7 %", "", "2.35 ± 0.50", "")
+        *("this run (elsewhere/first)", "seen", "table", "orthographic", "8", "75 %", "12.3 % to 87.7 %", ""),
+        *("2.35 ± 0.50", ""),
     ]
-    assert chance[4:] == ["50 %", "12.3 % to 87.7 %", "", "no success", "not on the same scenes"]
+    assert chance[5:] == ["50 %", "12.3 % to 87.7 %", "", "no success", "not on the same scenes"]
     # 6 scenes only this run, 1 only clear: +62.5 points, McNemar 2 (1 + 7) / 2^7 = 0.125.
-    assert clear[0] == "clear" and clear[4] == "12.5 %"
-    assert clear[8].startswith("+62 points (") and clear[8].endswith("p = 0.12")
+    assert clear[0] == "clear" and clear[5] == "12.5 %"
+    assert clear[9].startswith("+62 points (") and clear[9].endswith("p = 0.12")
+
+
+def test_evaluations_in_another_place_are_told_apart(tmp_path: Path) -> None:
+    task = to_dict(PRESETS["ci"].task) | {"workspace": "shelf", "place": {"half_width": 0.25, "back": None}}
+    run_dir = write_run(tmp_path / "first", task=task)
+    there = {"workspace": "shelf", "workspace_hash": "w"}
+    write_evaluation(run_dir / "evaluations" / "a.json", "first", [1, 0], **there)
+    write_evaluation(run_dir / "evaluations" / "b.json", "pretrained", [0, 0])
+    write_evaluation(run_dir / "evaluations" / "c.json", "clear", [0, 0])
+    run = read_run(run_dir)
+    cells = _texts(build_page(run, load_evaluations(run)))
+    assert cells.count("in another place") == 2 and "shelf" in cells
+    lacking = dict(missing(run, load_evaluations(run)))
+    assert "clear on seen objects" in lacking, "it was run on the open table only"
+    assert "--workspace shelf --task.place.half-width 0.25 --json" in lacking["clear on seen objects"]
 
 
 def test_files_named_on_the_command_line_replace_those_of_the_folder(run_dir: Path, tmp_path: Path) -> None:
@@ -51,7 +67,9 @@ def test_files_named_on_the_command_line_replace_those_of_the_folder(run_dir: Pa
 
 def test_missing_evaluations_are_named_with_their_command(run_dir: Path) -> None:
     run = read_run(run_dir)
-    assert [what for what, _ in missing(run, [])] == [f"{who} on seen objects" for who in ("this run", *BASELINES)]
+    assert [what for what, _ in missing(run, [])] == [
+        f"{who} on seen objects" for who in ("this run", *SCRIPTS["q_learning"])
+    ]
     write_evaluation(run_dir / "evaluations" / "a.json", "clear", [1, 0] * 20)
     write_evaluation(run_dir / "evaluations" / "b.json", "first", [1, 0] * 20)
     lacking = dict(missing(run, load_evaluations(run)))
@@ -111,6 +129,17 @@ def test_failures_and_times_are_counted(run_dir: Path) -> None:
     times = time_figures(run)[0]
     assert "75 %, 67.5 s" in times and "25 %, 22.5 s" in times and "90 s in all" in times
     assert [duration(s) for s in (0, 100, 600, 36000)] == ["0 s", "100 s", "10 min", "10 h"]
+
+
+def test_what_was_in_the_way_stands_beside_its_reason(tmp_path: Path) -> None:
+    more = {"reasons/unreachable": 4, "unreachable/wall": 3, "unreachable/end_error": 1, "unreachable/no_ik": 0}
+    run_dir = write_run(tmp_path / "first", [log_row(100, 10.0, **more), log_row(200, 20.0, **more)])
+    stopped = {"failures": {"unreachable": 1}, "obstructions": {"unreachable": {"wall": 1}}, "workspace": "shelf"}
+    file = write_evaluation(run_dir / "a.json", "first", [1, 1, 1, 0], **stopped)
+    run = read_run(run_dir)
+    _, test, training = failure_figures(run, load_evaluations(run, [file]))
+    assert "seen objects, shelf, orthographic camera, 4 scenes" in test and "25 % (1: wall 1)" in test
+    assert "29 % (8: wall 6, end not reached 2)" in training and "(6)" in training
 
 
 # --- damaged and young runs ------------------------------------------------------------------------------------------

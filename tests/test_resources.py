@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from fake_training import make_config, make_program
 
-from pregrasp_jax import io
+from pregrasp_jax import io, machine
 from pregrasp_jax.training import resources
 
 
@@ -50,8 +50,8 @@ def test_a_resumed_run_needs_only_the_disk_that_it_does_not_hold(tmp_path, monke
 
 
 def test_memory_is_read_from_machine_and_control_group(tmp_path, monkeypatch):
-    monkeypatch.setattr(resources, "_MEMINFO", tmp_path / "meminfo")
-    monkeypatch.setattr(resources, "_CGROUP", tmp_path)
+    monkeypatch.setattr(machine, "_MEMINFO", tmp_path / "meminfo")
+    monkeypatch.setattr(machine, "_CGROUP", tmp_path)
     assert resources.available_memory() is None
     (tmp_path / "meminfo").write_text("MemTotal: 900 kB\nMemAvailable:   500 kB\nHugePages_Total:   0\n")
     (tmp_path / "memory.max").write_text("max\n")

@@ -143,7 +143,7 @@ def test_no_posture_of_the_start_branch_lets_the_arm_touch_itself_or_the_table(d
     x, y = np.meshgrid(np.linspace(-0.3, 0.25, 5), np.linspace(-0.25, 0.25, 5))
     hand = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.1), np.tile([1, 0, 0, 0], (x.size, 1))])
     hand = np.concatenate([[START_POSE], hand]).astype(np.float32)
-    solutions = np.asarray(jax.jit(jax.vmap(hand_inverse_kinematics))(hand))
+    solutions = np.asarray(jax.jit(jax.vmap(functools.partial(hand_inverse_kinematics, description.arm())))(hand))
     branch = int(np.nanargmin(np.abs(solutions[0] - ROBOT.home[:6]).max(axis=1)))
     pairs = [
         (a.name, b.name)

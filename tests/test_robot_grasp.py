@@ -1,5 +1,7 @@
 """The robot's physics without the rest of the package: it tracks a push, and holds what it closes on."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -29,10 +31,12 @@ def minimum_jerk(s):
 def follow(positions, reference):
     """Arm joints [T, 6] that take the grasp point through positions [T, 3], hand level, without jumps."""
     level = jnp.broadcast_to(jnp.array([1.0, 0, 0, 0]), (len(positions), 4))
-    solutions = jax.vmap(kinematics.hand_inverse_kinematics)(jnp.concatenate([positions, level], axis=1))
+    solutions = jax.vmap(functools.partial(kinematics.hand_inverse_kinematics, description.arm()))(
+        jnp.concatenate([positions, level], axis=1)
+    )
 
     def step(previous, rows):
-        candidates = kinematics.unwrap_near(rows, previous)
+        candidates = kinematics.unwrap_near(description.arm(), rows, previous)
         gap = jnp.max(jnp.abs(candidates - previous[None]), axis=-1)
         joints = candidates[jnp.nanargmin(gap)]
         return joints, joints

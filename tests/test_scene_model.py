@@ -72,7 +72,7 @@ def scene(bank: HullBank, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def initial_state(simulations: Simulations, poses: np.ndarray) -> np.ndarray:
     """Return states [E, nstate] with the robot at the start and objects at poses [E, MAX_OBJECTS, 7]."""
-    state = np.tile(simulations.home_state(), (len(poses), 1))
+    state = np.tile(simulations.home_states()[0], (len(poses), 1))
     simulations.coordinates(state)[0][:, simulations.model.slot_qpos_ids] = poses
     return state
 

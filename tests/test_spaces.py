@@ -164,5 +164,7 @@ def test_places_are_found_by_name(monkeypatch):
     room = Workspace(name="room")
     monkeypatch.setitem(WORKSPACES, "room", room)
     assert get_workspace("room") is room
-    with pytest.raises(ValueError, match=r"task\.workspace = 'moon' does not exist; allowed: room, table"):
+    with pytest.raises(
+        ValueError, match=r"task\.workspace = 'moon' does not exist; allowed: narrow, room, shelf, table"
+    ):
         get_workspace("moon")

@@ -108,6 +108,23 @@ def test_compare_reports_settings_that_may_differ() -> None:
     assert "camera: orthographic | pinhole" in text
 
 
+def test_two_places_are_paired_only_when_asked_to() -> None:
+    there = {**B, "workspace": "shelf", "workspace_hash": "v", "config": {"task": {"place": {"back": 0.3}}}}
+    refused = "workspace is table in the first file and shelf in the second; allowed are equal ones, or --across-work"
+    with pytest.raises(ValueError, match=refused):
+        compare(A, there)
+    result = compare(A, there, across_workspaces=True)
+    assert (result.only_a, result.only_b) == (3, 1) and result.settings == ("workspace: table | shelf",)
+    wider = {**there, "workspace_hash": "w", "config": {"task": {"place": {"back": 0.4}}}}
+    with pytest.raises(ValueError, match="workspace is shelf v in the first file and shelf w in the second"):
+        compare(there, wider)
+    settings = compare(there, wider, across_workspaces=True).settings
+    assert settings == ("workspace: shelf v | shelf w", "task.place.back: 0.3 | 0.4")
+    assert compare(there, there).settings == ()
+    # An evaluation of an earlier version names no place, or no dimensions.
+    assert compare(A, {**B, "workspace": "table", "workspace_hash": "u"}).settings == ()
+
+
 @pytest.mark.parametrize(
     ("other", "message"),
     [

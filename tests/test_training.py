@@ -29,7 +29,7 @@ from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training import collect, learn
 from pregrasp_jax.training.run_folder import RunFolder, stored_config
 from pregrasp_jax.training.trainer import Trainer
-from pregrasp_jax.types import REASONS, EnvState, StepResult
+from pregrasp_jax.types import OBSTRUCTIONS, PUSH_REASONS, EnvState, StepResult
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def finished(tmp_path_factory) -> Trainer:
 def test_metrics_add_up(finished):
     log = [row for row in rows(finished.recorder.folder.path) if "train/loss" in row]
     assert [row["env_steps"] for row in log] == list(range(6, log[-1]["env_steps"] + 1, 6))
-    ended = sum(row[f"reasons/{name}"] for row in log for name in REASONS if name != "running")
+    ended = sum(row[f"reasons/{name}"] for row in log for name in PUSH_REASONS if name != "running")
     assert ended == log[-1]["episodes"] > 10
     last = log[-1]
     assert last["gradient_steps"] == int((last["env_steps"] - 9) * 0.25)
@@ -63,7 +63,7 @@ def test_branches_are_learned_from_and_change_nothing_else():
     params, branch_actions = state.learning.learner.params, []
     for step in range(1, 9):
         before = state.actors
-        actors, experience = collect_once(before, params)
+        actors, experience = collect_once(before, params, built.pace)
         learning = remember(state.learning, experience)
         state = state.replace(actors=actors, learning=learning)
         steps = experience.steps
@@ -247,7 +247,7 @@ def test_the_step_size_decays_linearly_and_stays():
     steady = dataclasses.replace(PRESETS["ci"].learner, learning_rate=0.1, learning_rate_steps=0)
     decaying = dataclasses.replace(steady, final_learning_rate=0.02, learning_rate_steps=4)
     for config, expected in ((steady, [0.1] * 7), (decaying, [0.1, 0.08, 0.06, 0.04, 0.02, 0.02, 0.02])):
-        optimizer = learn.make_optimizer(config)
+        optimizer = learn.make_optimizer(config, config.learning_rate_steps)
         state, sizes = optimizer.init(jnp.float32(0)), []
         for _ in expected:
             step, state = optimizer.update(jnp.float32(3), state)
@@ -268,19 +268,30 @@ def test_tally_keeps_the_reasons_of_the_last_episodes():
         explored=jnp.int32(0),
         overflowed=jnp.int32(0),
         diverged=jnp.int32(0),
-        reasons=jnp.zeros(len(REASONS), jnp.int32),
+        reasons=jnp.zeros(len(PUSH_REASONS), jnp.int32),
+        obstructions=jnp.zeros(len(OBSTRUCTIONS), jnp.int32),
     )
-    success, truncated = REASONS.index("target_in_region"), REASONS.index("truncated")
-    pushes = [([success, 0, truncated], [1, 0, 1]), ([0, success, success], [0, 1, 1]), ([truncated, 0, 0], [1, 0, 0])]
+    success, truncated = PUSH_REASONS.index("target_in_region"), PUSH_REASONS.index("truncated")
+    stopped, wall, error = (
+        PUSH_REASONS.index("unreachable"),
+        OBSTRUCTIONS.index("wall"),
+        OBSTRUCTIONS.index("end_error"),
+    )
+    pushes = [([success, 0, truncated], [1, 0, 1]), ([0, success, success], [0, 1, 1]), ([stopped, 0, 0], [1, 0, 0])]
     for reason, ended in pushes:
-        results: Any = SimpleNamespace(reason=jnp.array(reason), reward=jnp.ones(3))
+        # A physics failure goes before what stopped the hand: only the reason tells.
+        outcome = SimpleNamespace(obstruction=jnp.array([wall if reason[0] == stopped else 0, 0, error]))
+        results: Any = SimpleNamespace(reason=jnp.array(reason), reward=jnp.ones(3), outcome=outcome)
         random, overflowed = jnp.array([True, False, False]), jnp.array([reason[0] == success, False, True])
         diverged = jnp.array([False, False, False, reason[1] == success, True])  # with a branch of two scenes
         tally = collect._count(tally, results, jnp.array(ended, bool), random, overflowed, diverged)
     report = collect.metrics(tally, (success,))
     assert report["train/success_rate"] == 0.5, "the first success has left the window of four"
     assert (report["episodes"], report["env_steps"]) == (5, 9)
-    assert (report["reasons/target_in_region"], report["reasons/truncated"]) == (3, 2)
+    assert (report["reasons/target_in_region"], report["reasons/truncated"]) == (3, 1)
+    assert {name: report[f"unreachable/{name}"] for name in OBSTRUCTIONS[1:] if report[f"unreachable/{name}"]} == {
+        "wall": 1
+    }
     assert report["train/explored"] == pytest.approx(1 / 3) and report["train/episode_length"] == pytest.approx(9 / 5)
     assert report["physics/overflows"] == 4, "one in the first scene, three in the last"
     assert report["physics/diverged"] == 4, "one in one branch, three in the last"
@@ -309,8 +320,8 @@ def test_a_push_is_traced_once_for_shapes_start_and_compilation_and_its_overflow
     state = jax.jit(built.init)(jax.random.key(0))
     compiled = built.compile(state)
     params = state.learning.learner.params
-    actors, _ = compiled.collect(state.actors, params)
-    actors, _ = compiled.collect(actors, params)
+    actors, _ = compiled.collect(state.actors, params, built.pace)
+    actors, _ = compiled.collect(actors, params, built.pace)
     assert len(env.traces) == 1
     assert collect.metrics(actors.tally, built.successes)["physics/overflows"] == 2 * config.train.num_envs
 
@@ -336,7 +347,7 @@ def test_a_scene_that_ended_starts_anew_and_the_others_go_on():
     collect_fn, params = jax.jit(built.collect), jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), params)
     for _ in range(12):
         before = actors
-        actors, experience = collect_fn(actors, params)
+        actors, experience = collect_fn(actors, params, built.pace)
         steps = experience.steps
         ended = np.asarray(steps.terminated | steps.truncated)
         pushed, _ = jax.vmap(env.step)(before.env_states, steps.action)
@@ -354,11 +365,11 @@ def test_the_learner_measures_what_the_report_prints(monkeypatch):
 
     def spy(*args: Any, **kwargs: Any) -> Any:
         result = original(*args, **kwargs)
-        measured.update(result[2])
+        measured.update(result[3])
         return result
 
     monkeypatch.setattr(learner, "update", spy)
     built = make_program(make_config())
     shapes = built.shapes()
-    jax.eval_shape(built.update, shapes.learning, jnp.float32(0))
+    jax.eval_shape(built.update, shapes.learning, jnp.float32(0), built.pace)
     assert measured == set(learn.METRICS)

@@ -13,7 +13,7 @@ from pregrasp_jax.robot.ur5e_rg2 import moving
 from pregrasp_jax.scene.spec import compile_spec, scene_spec
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.workspace import Box, Workspace
-from pregrasp_jax.task.env import refuse_walls
+from pregrasp_jax.task.place import refuse_walls
 from pregrasp_jax.types import TABLE_ID
 
 WALLS = Workspace(

@@ -20,6 +20,7 @@ import trimesh
 
 from pregrasp_jax.assets.bank import ConvexObject, load_bank, make_bank, save_bank, select
 from pregrasp_jax.assets.decompose import decompose
+from pregrasp_jax.assets.shapes import superellipse
 from pregrasp_jax.types import HullBank
 
 CATALOGUE_FILE = Path(__file__).with_name("catalogue.npz")
@@ -48,15 +49,11 @@ def lathe(*profile: tuple[float, float]) -> trimesh.Trimesh:
 
 
 def loft(*sections: tuple[float, float, float, float]) -> trimesh.Trimesh:
-    """Return the solid through horizontal superellipses (z, width x, depth y, exponent), bottom to top.
-
-    Exponent 2 is an ellipse, 8 and more a box with rounded edges.
-    """
-    angle = np.arange(_SECTIONS) * (2 * np.pi / _SECTIONS)
+    """Return the solid through horizontal superellipses (z, width x, depth y, exponent), bottom to top."""
     rings = []
     for z, width, depth, exponent in sections:
-        x, y = (np.sign(f) * np.abs(f) ** (2 / exponent) for f in (np.cos(angle), np.sin(angle)))
-        rings.append(np.column_stack([width / 2 * x, depth / 2 * y, np.full(_SECTIONS, z)]))
+        outline = superellipse(width, depth, exponent, _SECTIONS)
+        rings.append(np.column_stack([outline, np.full(_SECTIONS, z)]))
     bottom, top = len(rings) * _SECTIONS, len(rings) * _SECTIONS + 1
     here = np.arange(_SECTIONS)
     after = (here + 1) % _SECTIONS

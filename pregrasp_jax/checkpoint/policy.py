@@ -26,11 +26,22 @@ FORMAT = "pregrasp_jax policy 2"
 _FORMAT_1 = "pregrasp_jax policy 1"
 """Of earlier runs; its checksum covers the parameters alone."""
 
-PRETRAINED = Path(__file__).parent.parent / "pretrained"
-"""The policy that ships with the package."""
+PPG = "ppg"
+"""Name of the policy of strokes that ships with the package."""
+
+_PACKAGE = Path(__file__).parent.parent
+
+SHIPPED = {"pretrained": _PACKAGE / "pretrained", PPG: _PACKAGE / "pretrained_ppg"}
+"""Folders of the policies that ship with the package."""
+
+PRETRAINED = SHIPPED["pretrained"]
+"""The one of the paper's method."""
 
 _PARAMS = "params.safetensors"
-_ALLOWED = f"pretrained, a run folder, or a folder with the {_PARAMS} that it wrote"
+BUNDLED = "policy.safetensors"
+"""The same file in an exported bundle."""
+
+_ALLOWED = f"pretrained, a run folder, a folder with the {_PARAMS} that it wrote, or an exported bundle"
 
 
 @dataclass(frozen=True)
@@ -52,24 +63,28 @@ class TrainedPolicy:
 
 def save_policy(folder: Path, params: Any, config: Config, evaluation: dict[str, Any]) -> None:
     """Write a policy. `params.safetensors` alone is complete; the two other files repeat its header for people."""
-    arrays = trees.named_leaves(params)
-    about = {"format": FORMAT, "config": json.dumps(to_dict(config)), "evaluation": json.dumps(evaluation)}
-    metadata = about | {"checksum": _checksum(arrays, about)}
-    io.write_bytes(folder / _PARAMS, trees.encode(arrays, metadata))
+    io.write_bytes(folder / _PARAMS, policy_bytes(params, config, evaluation))
     write_config(folder / CONFIG, config)
     io.write_json(folder / "evaluation.json", evaluation)
+
+
+def policy_bytes(params: Any, config: Config, evaluation: dict[str, Any]) -> bytes:
+    """Return a policy as safetensors: its parameters, and in the header everything else."""
+    arrays = trees.named_leaves(params)
+    about = {"format": FORMAT, "config": json.dumps(to_dict(config)), "evaluation": json.dumps(evaluation)}
+    return trees.encode(arrays, about | {"checksum": _checksum(arrays, about)})
 
 
 def load_policy(path: Path | str) -> TrainedPolicy:
     """Read a policy from a run folder (its best policy, else its latest checkpoint), a policy folder, or a file.
 
-    The name `pretrained` is that of the policy that ships with the package.
+    The names in `SHIPPED` are those of policies that ship with the package.
 
     Raises:
         ValueError: nothing there, damaged, or not written by `save_policy`; one line says which.
     """
-    path = PRETRAINED if str(path) == "pretrained" else Path(path)
-    for candidate in (path, path / _PARAMS, path / "best" / _PARAMS):
+    path = SHIPPED.get(str(path), Path(path))
+    for candidate in (path, path / _PARAMS, path / "best" / _PARAMS, path / BUNDLED):
         if candidate.is_file():
             try:
                 return _read_policy(candidate)

@@ -11,7 +11,7 @@ from typing import Any
 from pregrasp_jax import io, yaml_file
 from pregrasp_jax.config import Config, difference, from_dict, to_dict
 
-CHANGEABLE = ("train.minutes", "train.episodes", "train.tensorboard", "assets.object_dir")
+CHANGEABLE = ("train.minutes", "train.episodes", "train.env_steps", "train.tensorboard", "assets.object_dir")
 """Settings that may change when a run is resumed: when it stops, what it tells, and where its meshes lie, which must
 be the same ones."""
 

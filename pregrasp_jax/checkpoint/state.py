@@ -189,6 +189,24 @@ def read_newest_policy(folder: Path) -> tuple[dict[str, np.ndarray], Path]:
     raise ValueError(f"{folder} holds no intact checkpoint")
 
 
+def read_ring(folder: Path, ring_template: Any) -> tuple[Any, int]:
+    """Return the observations of the newest intact checkpoint and how many were written; changes nothing on disk.
+
+    Raises:
+        ValueError: there is none.
+    """
+    for path in _newest_first(folder):
+        try:
+            manifest = _read_manifest(path)
+        except DamagedFileError:
+            continue
+        listed, written = [Chunk(*row) for row in manifest["chunks"]], manifest["observations"]
+        contents, _, problems = chunks.restore(folder / _REPLAY, ring_template, written, listed)
+        if not problems:
+            return contents, written
+    raise ValueError(f"{folder} holds no intact checkpoint")
+
+
 def _newest_first(folder: Path) -> Iterator[Path]:
     """Yield the folders of committed checkpoints."""
     named = [path for path in folder.glob("*") if path.name.isdigit() and (path / _MANIFEST).is_file()]

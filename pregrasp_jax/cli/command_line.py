@@ -1,6 +1,7 @@
 """Errors of a command line in one line, exit code 2, no traceback."""
 
 import contextlib
+import functools
 import io as text_io
 import re
 import sys
@@ -32,6 +33,16 @@ def parse(parser: Callable[[], T]) -> T:
         if error.code:
             print(f"error: {unbox(complaint.getvalue())}", file=sys.stderr)
         raise
+
+
+def deferred(function: Callable[..., int | None]) -> Callable[..., Callable[[], int | None]]:
+    """Return a function with the same options that returns the call instead of making it."""
+
+    @functools.wraps(function)
+    def bind(*args: object, **options: object) -> Callable[[], int | None]:
+        return functools.partial(function, *args, **options)
+
+    return bind
 
 
 def unbox(text: str) -> str:

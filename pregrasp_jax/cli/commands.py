@@ -11,6 +11,7 @@ from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.meshes import LoadedDir, load_object_dir
 from pregrasp_jax.assets.sets import format_table
+from pregrasp_jax.assets.variants import variant_bank
 from pregrasp_jax.cli import doctor as machine_doctor
 from pregrasp_jax.cli.outputs import refuse_unwritable
 from pregrasp_jax.config import (
@@ -29,7 +30,7 @@ from pregrasp_jax.evaluation.statistics import compare as compare_evaluations
 from pregrasp_jax.evaluation.statistics import format_comparison
 from pregrasp_jax.report.play import draw_decision, draw_scenes
 from pregrasp_jax.robot import get_robot
-from pregrasp_jax.scene.bank import SceneBank
+from pregrasp_jax.scene.bank import SPLITS, SceneBank
 from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import make_env
 from pregrasp_jax.types import HullBank
@@ -39,7 +40,12 @@ _SHOWN_SCENES = 12
 
 
 def assets(
-    object_dir: Path | None = None, /, *, object_set: ObjectSet | None = None, png: Path = Path("assets.png")
+    object_dir: Path | None = None,
+    /,
+    *,
+    object_set: ObjectSet | None = None,
+    variants: int = 0,
+    png: Path = Path("assets.png"),
 ) -> None:
     """List the objects of a mesh folder (or the built-in ones): hulls, size, mass, whether they can be targets.
 
@@ -47,14 +53,20 @@ def assets(
         object_dir: folder of .obj/.stl/.ply/.glb/.gltf/.off/.dae meshes, or of folders with one each, with
             subfolders seen and unseen or without; the built-in catalogue if left out.
         object_set: only this set; all that there are if left out.
+        variants: list instead so many objects made beside each set, as a training with `assets.variants` meets them.
         png: contact sheet of the objects, .png, .jpg, .jpeg or .webp; with two sets their names are added to that of
             the file.
     """
     refuse_unwritable(png, "image")
+    Config(assets=AssetsConfig(variants=variants)).validate()
     prepare()
     names: Sequence[ObjectSet] = (object_set,) if object_set else _object_sets(object_dir)
     for name in names:
         loaded = _load_objects(object_dir, name)
+        if variants:
+            loaded = LoadedDir(
+                variant_bank(loaded.bank, variants, seed=(SceneConfig().bank_seed, SPLITS.index("train")))
+            )
         eligible, why_not = get_robot(TaskConfig().robot).eligibility(loaded.bank)
         file = png if len(names) == 1 else png.with_stem(f"{png.stem}-{name}")
         print(f"{name} ({object_dir or 'built in'})\n{format_table(loaded, why_not)}")
@@ -62,16 +74,17 @@ def assets(
             _write_image(file, contact_sheet(loaded.bank, eligible))
 
 
-def compare(a: Path, b: Path, /, *, json: Path | None = None) -> None:
+def compare(a: Path, b: Path, /, *, across_workspaces: bool = False, json: Path | None = None) -> None:
     """Compare two evaluations on the same scenes: intervals, and McNemar's exact test of their difference.
 
     Args:
         a: file written by `pregrasp-jax evaluate --json`.
         b: another, of the same scenes.
+        across_workspaces: the two may be of different places, as the open table and a shelf.
         json: write the comparison here.
     """
     refuse_unwritable(json, "json")
-    comparison = compare_evaluations(load_evaluation(a), load_evaluation(b))
+    comparison = compare_evaluations(load_evaluation(a), load_evaluation(b), across_workspaces=across_workspaces)
     print(format_comparison(comparison))
     if json:
         io.write_json(json, comparison.to_dict())
@@ -115,6 +128,7 @@ def show(
     pushes: int = 0,
     object_dir: str | None = None,
     object_set: ObjectSet = "seen",
+    workspace: str | None = None,
     camera: Literal["orthographic", "pinhole"] | None = None,
     png: Path = Path("scene.png"),
 ) -> None:
@@ -126,6 +140,7 @@ def show(
         pushes: let the policy push so often before the picture is taken.
         object_dir: folder of meshes; the built-in catalogue if left out.
         object_set: objects used in training, or kept for evaluation.
+        workspace: where; the policy's own if left out, the open table for a script.
         camera: what the policy sees through.
         png: the picture; .png, .jpg, .jpeg or .webp.
     """
@@ -133,7 +148,7 @@ def show(
     if pushes < 0:
         raise ValueError(f"pushes = {pushes} is out of range; allowed is 0 and more")
     assets_config = AssetsConfig(object_dir=object_dir, object_set=object_set)
-    task = TaskOverrides(camera=camera)
+    task = TaskOverrides(workspace=workspace, camera=camera)
     player = make_player(EvaluationConfig(policy=policy, assets=assets_config, task=task))
     if not 0 <= scene < len(player.env.scenes):
         raise ValueError(f"scene = {scene} is out of range; allowed is 0 to {len(player.env.scenes) - 1}")

@@ -11,7 +11,9 @@ from pregrasp_jax.config import EvaluationConfig
 ALIASES = {
     "--object-dir": "--assets.object-dir",
     "--object-set": "--assets.object-set",
+    "--workspace": "--task.workspace",
     "--camera": "--task.camera",
+    "--sensor": "--task.sensor",
     "--r-out": "--task.r-out",
     "--obstacles-may-leave": "--task.obstacles-may-leave",
 }
@@ -29,8 +31,8 @@ def evaluate_options(
     Prints a table, and writes a JSON file and a film where asked for:
     `pregrasp-jax evaluate --policy runs/NAME --object-set seen --episodes 100 --json result.json`
 
-    The options are named as those of `train`. Short names: --object-dir, --object-set, --camera, --r-out,
-    --obstacles-may-leave.
+    The options are named as those of `train`. Short names: --object-dir, --object-set, --workspace, --camera,
+    --sensor, --r-out, --obstacles-may-leave.
 
     Args:
         request: What to evaluate.

@@ -1,6 +1,5 @@
 """The program `pregrasp-jax`: its subcommands by name, each of which is imported when it is asked for."""
 
-import functools
 import pkgutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +9,7 @@ from typing import Any
 import tyro
 
 import pregrasp_jax
-from pregrasp_jax.cli.command_line import INTERRUPTED, one_line_errors, parse
+from pregrasp_jax.cli.command_line import INTERRUPTED, deferred, one_line_errors, parse
 
 PROGRAM = "pregrasp-jax"
 
@@ -38,19 +37,26 @@ class Command:
 
 COMMANDS = {
     "assets": Command("List and draw the objects of a mesh folder.", "pregrasp_jax.cli.commands:assets"),
+    "calibrate-check": Command("Say how well a calibration fits the table.", "pregrasp_jax.cli.deploy:calibrate_check"),
     "compare": Command("Compare two evaluations on the same scenes.", "pregrasp_jax.cli.commands:compare"),
+    "contract": Command("Print what a bundle says about itself.", "pregrasp_jax.cli.export:contract"),
     "demo": Command("See the shipped policy at work, then train for minutes.", "pregrasp_jax.cli.demo:demo"),
+    "deploy": Command("Run a bundle on a robot, or in simulation.", "pregrasp_jax.cli.deploy:deploy"),
     "doctor": Command("Say what this machine offers.", "pregrasp_jax.cli.commands:doctor"),
     "evaluate": Command(
         "Evaluate a policy on fixed test scenes.",
         "pregrasp_jax.cli.evaluate:evaluate_options",
         aliases="pregrasp_jax.cli.evaluate:ALIASES",
     ),
+    "export": Command("Write a policy as a bundle that runs without JAX.", "pregrasp_jax.cli.export:export"),
     "replay-dump": Command("Repeat a push on which the physics diverged.", "pregrasp_jax.cli.replay:replay_dump"),
     "report": Command("Write the page of a run.", "pregrasp_jax.cli.report:report"),
+    "reproduce": Command("Make a table or figure of the paper.", "pregrasp_jax.cli.reproduce:reproduce"),
     "scenes": Command("Describe and draw a bank of packed scenes.", "pregrasp_jax.cli.commands:scenes"),
     "show": Command("Draw one decision of a policy.", "pregrasp_jax.cli.commands:show"),
+    "sweep": Command("Train many settings, and find the best.", "pregrasp_jax.cli.sweep:commands", nested=True),
     "train": Command("Train a policy, or continue a run.", "pregrasp_jax.cli.train:sessions", nested=True),
+    "verify": Command("Compare every file of a bundle with its golden answers.", "pregrasp_jax.cli.export:verify"),
 }
 
 
@@ -88,7 +94,7 @@ def _bind(command: Command, options: list[str], prog: str) -> Callable[[], int |
         return _parse_nested(target(options), options, prog, command.summary)
     if command.aliases:
         options = _spelled_out(options, pkgutil.resolve_name(command.aliases))
-    return parse(lambda: tyro.cli(_deferred(target), prog=prog, args=options, config=(tyro.conf.FlagConversionOff,)))
+    return parse(lambda: tyro.cli(deferred(target), prog=prog, args=options, config=(tyro.conf.FlagConversionOff,)))
 
 
 def _spelled_out(options: list[str], aliases: Mapping[str, str]) -> list[str]:
@@ -106,16 +112,6 @@ def _parse_nested(
             parsers, prog=prog, args=arguments, description=description, config=(tyro.conf.FlagConversionOff,)
         )
     )
-
-
-def _deferred(function: Callable[..., int | None]) -> Callable[..., Callable[[], int | None]]:
-    """Return a function with the same options that returns the call instead of making it."""
-
-    @functools.wraps(function)
-    def bind(*args: object, **options: object) -> Callable[[], int | None]:
-        return functools.partial(function, *args, **options)
-
-    return bind
 
 
 def _summary(command: Command) -> Callable[[], Any]:

@@ -11,12 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax import drawing
-from pregrasp_jax.assets.sets import load_bank_for
 from pregrasp_jax.cli.outputs import refuse_unwritable
-from pregrasp_jax.report.play import describe_action, env_hulls, in_batch
+from pregrasp_jax.report.play import describe_action, env_hulls, in_batch, taken_action
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.startup import prepare
-from pregrasp_jax.task.env import Env, assemble
+from pregrasp_jax.task.env import Env, assemble, load_split_bank
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training.dump import Dump, load_dump
 from pregrasp_jax.training.mishap import Mishap
@@ -82,7 +81,7 @@ def make_replay_env(dump: Dump, engine: str, object_dir: str | None = None) -> E
     """
     config = dump.config
     assets = dataclasses.replace(config.assets, object_dir=object_dir or config.assets.object_dir)
-    bank = load_bank_for(assets.object_dir, assets.object_set)
+    bank = load_split_bank(dataclasses.replace(config, assets=assets), "train")
     if bank.content_hash != dump.hull_bank_hash:
         raise ValueError(
             f"{dump.path} is of other objects (hull bank {dump.hull_bank_hash}, {assets.object_dir or 'the built-in'} "
@@ -123,7 +122,7 @@ def describe_replay(env: Env, dump: Dump, mishap: Mishap, replay: RepeatedPush) 
     kind = f"branch {int(mishap.branch)}" if mishap.branch else "the real one"
     ended = "diverged" if replay.result.outcome.diverged else "did not diverge"
     lines = {
-        "push": f"{describe_action(env, int(mishap.action))} in {replay.duration:.2f} s; number "
+        "push": f"{describe_action(env, mishap.hand, mishap.action)} in {replay.duration:.2f} s; number "
         f"{int(mishap.state.num_pushes) + 1} of its episode, {kind}",
         "training": f"scene {int(mishap.scene)} at step {int(mishap.env_steps)} on {dump.engine}",
         "reason": f"{REASONS[int(replay.result.reason)]}; the physics {ended}",
@@ -143,7 +142,7 @@ def draw_replay(env: Env, mishap: Mishap, replay: RepeatedPush) -> np.ndarray:
         target,
         actions=env.primitive.actions,
         mask=np.asarray(env.action_mask(before.hand)),
-        action=int(mishap.action),
+        taken=taken_action(env, before.hand, mishap.action),
     )
     seen = replay.after.physics_obs
     if all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(seen)):

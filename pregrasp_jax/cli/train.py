@@ -29,6 +29,7 @@ def _start(preset: Config) -> Callable[..., Session]:
         config: Annotated[Config, tyro.conf.arg(name="")] = preset,
         init_from: Path | None = None,
         distributed: bool = False,
+        films: bool = True,
     ) -> Session:
         """Start a run. A session leaves a report behind, RUN_DIR/report.html.
 
@@ -41,11 +42,12 @@ def _start(preset: Config) -> Callable[..., Session]:
             config: Settings.
             init_from: Run or policy folder, or `pretrained`, whose parameters are the initial ones (fine-tuning).
             distributed: Train with the processes of other hosts, started with the same options (docs/devices.md).
+            films: Whether the report shows episodes.
         """
         from pregrasp_jax.training.session import train
 
         session = functools.partial(train, config.validate(), run_dir, init_from=init_from)
-        return _with_report(session, run_dir, distributed=distributed)
+        return _with_report(session, run_dir, distributed=distributed, films=films)
 
     return start
 
@@ -55,24 +57,28 @@ def _resume(stored: Config) -> Callable[..., Session]:
         run_dir: Annotated[Path, tyro.conf.Positional],
         config: Annotated[Config, tyro.conf.arg(name="")] = stored,
         distributed: bool = False,
+        films: bool = True,
     ) -> Session:
         """Continue a run from its newest intact checkpoint; its report is written as after the first session.
 
-        Only train.minutes, train.episodes, train.tensorboard and assets.object_dir may change, here or in config.yaml.
+        Only train.minutes, train.episodes, train.env_steps, train.tensorboard and assets.object_dir may change, here or
+        in config.yaml. Schedules stay those of the length that the run had at first.
 
         Args:
             run_dir: Folder of the run.
             config: Settings, as stored in the run.
             distributed: Train with the processes of other hosts, started with the same options (docs/devices.md).
+            films: Whether the report shows episodes.
         """
         from pregrasp_jax.training.session import resume
 
-        return _with_report(functools.partial(resume, config.validate(), run_dir), run_dir, distributed=distributed)
+        session = functools.partial(resume, config.validate(), run_dir)
+        return _with_report(session, run_dir, distributed=distributed, films=films)
 
     return resume
 
 
-def _with_report(session: Session, run_dir: Path, *, distributed: bool) -> Session:
+def _with_report(session: Session, run_dir: Path, *, distributed: bool, films: bool) -> Session:
     """Return a session, one of several processes if `distributed`, that leaves the report of the run behind.
 
     One that is refused leaves nothing.
@@ -86,7 +92,7 @@ def _with_report(session: Session, run_dir: Path, *, distributed: bool) -> Sessi
         code = session()
         if processes.is_first():
             # Other processes would wait for this one while it plays.
-            _report(run_dir, finished=code == 0 and not distributed)
+            _report(run_dir, finished=code == 0 and films and not distributed)
         return code
 
     return run

@@ -1,12 +1,35 @@
 """Maps of the grid as seen from above: world +x to the right and +y up, so row 0 is the bottom of the picture."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from PIL import Image, ImageDraw
 
-from pregrasp_jax.drawing.shaded import instance_colors
 from pregrasp_jax.spaces import grid
+
+OBSTACLE_COLORS = np.array(
+    [
+        [126, 148, 166],
+        [163, 153, 126],
+        [131, 160, 140],
+        [168, 138, 138],
+        [146, 134, 164],
+        [112, 150, 156],
+        [176, 160, 148],
+        [142, 150, 120],
+    ]
+)
+"""Muted, by slot; near enough to each other that the target stands out, far enough to tell neighbours apart."""
+
+TARGET_COLOR, ROBOT_COLOR, TABLE_COLOR = np.array([228, 88, 36]), np.array([84, 89, 98]), np.array([226, 222, 212])
+
+
+def instance_colors(target_slot: int | None) -> np.ndarray:
+    """Return the colour [10, 3] of every instance id: table, eight slots, robot."""
+    colors = np.concatenate([TABLE_COLOR[None], OBSTACLE_COLORS, ROBOT_COLOR[None]]).astype(float)
+    if target_slot is not None:
+        colors[target_slot + 1] = TARGET_COLOR
+    return colors
 
 
 def _stops(text: str) -> np.ndarray:
@@ -27,12 +50,21 @@ _INFERNO = _stops(
 
 def draw_heightmap(height: np.ndarray, *, size: int = 300) -> np.ndarray:
     """Draw heights [H, W], uint8 as observed, as a map of size x size pixels; brighter is higher."""
-    return _as_map(_colors(np.asarray(height, np.uint8) / 255, _CIVIDIS), size)
+    return as_map(_colors(np.asarray(height, np.uint8) / 255, _CIVIDIS), size)
 
 
 def draw_segmentation(instance_ids: np.ndarray, *, target_slot: int | None = None, size: int = 300) -> np.ndarray:
     """Draw instance ids [H, W] in the colours of `draw_camera` as a map of size x size pixels."""
-    return _as_map(instance_colors(target_slot)[np.asarray(instance_ids)], size)
+    return as_map(instance_colors(target_slot)[np.asarray(instance_ids)], size)
+
+
+def draw_labels(labels: np.ndarray, names: Mapping[str, int], *, size: int = 300) -> np.ndarray:
+    """Draw labels [H, W] of a fused segmentation, `names` -> value, as a map of size x size pixels."""
+    of_name = {"table": TABLE_COLOR, "obstacle": OBSTACLE_COLORS[0], "target": TARGET_COLOR, "robot": ROBOT_COLOR}
+    colors = np.zeros((max(names.values()) + 1, 3))
+    for name, value in names.items():
+        colors[value] = of_name[name]
+    return as_map(colors[labels], size)
 
 
 def draw_q_map(
@@ -62,10 +94,10 @@ def draw_q_map(
     low, high = limits or (inside.min(), inside.max())
     colors = _colors((q - low) / max(high - low, 1e-9), _INFERNO)
     shade = np.zeros(q.shape) if backdrop is None else np.asarray(backdrop, float) / 255
-    image = _as_map(np.where(mask[..., None], colors, 70 + 110 * shade[..., None]), size)
+    image = as_map(np.where(mask[..., None], colors, 70 + 110 * shade[..., None]), size)
     picture = Image.fromarray(image)
     canvas = ImageDraw.Draw(picture)
-    fine = _as_map(np.repeat(mask[..., None], 3, axis=-1) * 255.0, size)[..., 0] > 0
+    fine = as_map(np.repeat(mask[..., None], 3, axis=-1) * 255.0, size)[..., 0] > 0
     padded = np.pad(fine, 1)
     interior = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     canvas.bitmap((0, 0), Image.fromarray(((fine & ~interior) * 255).astype(np.uint8)), fill=(240, 240, 240))
@@ -80,7 +112,7 @@ def _colors(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(values, at, channel) for channel in stops.T], axis=-1)
 
 
-def _as_map(values: np.ndarray, size: int) -> np.ndarray:
+def as_map(values: np.ndarray, size: int) -> np.ndarray:
     """Return cells [H, W, 3] in 0 to 255 as a picture with +y up."""
     return np.asarray(Image.fromarray(values[::-1].astype(np.uint8)).resize((size, size), Image.Resampling.NEAREST))
 

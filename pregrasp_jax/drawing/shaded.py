@@ -6,25 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pregrasp_jax.drawing.maps import instance_colors
 from pregrasp_jax.heightmap import Camera, HullInstances, render_pinhole, unproject
 from pregrasp_jax.spaces import grid
-from pregrasp_jax.types import MAX_OBJECTS, ROBOT_ID, TABLE_ID
-
-OBSTACLE_COLORS = np.array(
-    [
-        [126, 148, 166],
-        [163, 153, 126],
-        [131, 160, 140],
-        [168, 138, 138],
-        [146, 134, 164],
-        [112, 150, 156],
-        [176, 160, 148],
-        [142, 150, 120],
-    ]
-)
-"""Muted, by slot; near enough to each other that the target stands out, far enough to tell neighbours apart."""
-
-TARGET_COLOR, ROBOT_COLOR, TABLE_COLOR = np.array([228, 88, 36]), np.array([84, 89, 98]), np.array([226, 222, 212])
+from pregrasp_jax.types import TABLE_ID
 
 _LAMP = (-0.6, -1.1, 1.5)
 """m; where the light comes from, left of the viewer."""
@@ -85,15 +70,6 @@ def draw_camera(hulls: HullInstances, *, target_slot: int | None = None, camera:
     image = instance_colors(target_slot)[ids] * brightness[..., None]
     image = image.reshape(rows, _SUPERSAMPLING, columns, _SUPERSAMPLING, 3).mean(axis=(1, 3))
     return np.clip(image, 0, 255).astype(np.uint8)
-
-
-def instance_colors(target_slot: int | None) -> np.ndarray:
-    """Return the colour [ROBOT_ID + 1, 3] of every instance id."""
-    colors = np.concatenate([TABLE_COLOR[None], OBSTACLE_COLORS[:MAX_OBJECTS], ROBOT_COLOR[None]]).astype(float)
-    if target_slot is not None:
-        colors[target_slot + 1] = TARGET_COLOR
-    assert len(colors) == ROBOT_ID + 1, "one colour per instance id"
-    return colors
 
 
 _render = jax.jit(render_pinhole)

@@ -1,6 +1,7 @@
 """Pictures side by side: the panel of one decision, the contact sheet of a bank."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,20 @@ _INK, _PAPER = (38, 40, 44), (250, 249, 246)
 """Colours of text and background."""
 
 
+class Taken(NamedTuple):
+    """An action as it is drawn.
+
+    Attributes:
+        choice: index of its Q map.
+        start: (x, y) m, where it begins.
+        end: (x, y) m.
+    """
+
+    choice: int
+    start: tuple[float, ...]
+    end: tuple[float, ...]
+
+
 def make_tiles(
     hulls: HullInstances,
     obs: Observation,
@@ -27,7 +42,7 @@ def make_tiles(
     actions: ActionSpace,
     mask: np.ndarray,
     q_values: np.ndarray | None = None,
-    action: int | None = None,
+    taken: Taken | None = None,
 ) -> list[tuple[str, np.ndarray]]:
     """Draw scene, height, segmentation, and one Q map per choice, with what is allowed and the chosen push.
 
@@ -38,15 +53,12 @@ def make_tiles(
         actions: what an action means; of more than `_MAX_MAPS` choices the best are drawn, the chosen one among them.
         mask: [H, W, K] bool, which actions are allowed.
         q_values: [H, W, K], or None for a policy without Q-values.
-        action: flat index of the chosen push, drawn on the map of its choice.
+        taken: the chosen action, drawn on the map of its choice.
 
     Returns:
         (caption, image [rows, columns, 3] uint8) of each.
     """
-    taken, push = None, None
-    if action is not None:
-        end, taken = actions.decode(np.int32(action))
-        push = np.asarray(obs.hand.xy).tolist(), end.tolist()
+    choice_taken, push = (None, None) if taken is None else (taken.choice, (taken.start, taken.end))
     mask = np.asarray(mask, bool)
     values = np.zeros(mask.shape) if q_values is None else np.asarray(q_values)
     allowed = values[mask]
@@ -54,10 +66,12 @@ def make_tiles(
     scene = draw_camera(hulls, target_slot=target_slot, camera=side_view((300, 400)))
     tiles = [("scene", scene), ("height, 0 to 0.30 m", draw_heightmap(np.asarray(obs.height)))]
     tiles.append(("segmentation", draw_segmentation(np.asarray(obs.instance_ids), target_slot=target_slot)))
+    # Of many choices without values only the chosen one says anything.
+    count = 1 if q_values is None and mask.shape[-1] > _MAX_MAPS else _MAX_MAPS
     best = np.where(mask, values, -np.inf).max(axis=(0, 1))
-    first = np.argsort(-np.where(np.arange(len(best)) == taken, np.inf, best), kind="stable")[:_MAX_MAPS]
+    first = np.argsort(-np.where(np.arange(len(best)) == choice_taken, np.inf, best), kind="stable")[:count]
     for choice in sorted(first):
-        chosen, shown = push if choice == taken else None, mask[..., choice]
+        chosen, shown = push if choice == choice_taken else None, mask[..., choice]
         image = draw_q_map(values[..., choice], shown, push=chosen, limits=limits, backdrop=np.asarray(obs.height))
         span = "" if q_values is None else f" {limits[0]:.2f} to {limits[1]:.2f}"
         tiles.append((f"{'push' if q_values is None else 'Q'} {actions.choices[choice].name}{span}", image))

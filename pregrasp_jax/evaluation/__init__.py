@@ -1,4 +1,9 @@
-"""Evaluation by the paper's protocol: run policies on fixed scenes, count, and describe the result."""
+"""Evaluation by the paper's protocol: run policies on fixed scenes, count, and describe the result.
+
+What plays is imported when it is asked for, so that what only counts, such as a sweep, does without JAX.
+"""
+
+from typing import TYPE_CHECKING, Any
 
 from pregrasp_jax.evaluation.results import (
     Episode,
@@ -8,7 +13,9 @@ from pregrasp_jax.evaluation.results import (
     format_evaluations,
     load_evaluation,
 )
-from pregrasp_jax.evaluation.runner import EpisodeCallback, Evaluator, evaluate_policy
+
+if TYPE_CHECKING:
+    from pregrasp_jax.evaluation.runner import EpisodeCallback, Evaluator, evaluate_policy
 
 __all__ = [
     "Episode",
@@ -21,3 +28,12 @@ __all__ = [
     "format_evaluations",
     "load_evaluation",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Return what plays."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__} has no attribute {name}")
+    from pregrasp_jax.evaluation import runner
+
+    return getattr(runner, name)

@@ -11,12 +11,22 @@ from typing import Any
 import jax
 
 from pregrasp_jax.checkpoint import load_policy
-from pregrasp_jax.config import Config, EvaluationConfig, TaskOverrides, with_absolute_paths
-from pregrasp_jax.evaluation import EpisodeCallback, Evaluator, evaluation_document
-from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.checkpoint.policy import PPG, SHIPPED
+from pregrasp_jax.config import (
+    Config,
+    EvaluationConfig,
+    PlaceConfig,
+    PlanningConfig,
+    TaskConfig,
+    TaskOverrides,
+    with_absolute_paths,
+)
+from pregrasp_jax.evaluation import EpisodeCallback, Evaluator, evaluation_document, learned
+from pregrasp_jax.evaluation.learned import STYLES
 from pregrasp_jax.machine import announced_compilation
+from pregrasp_jax.planning.planner import Planner
 from pregrasp_jax.policies import scripts
-from pregrasp_jax.policies.learned import make_learned
+from pregrasp_jax.policies.ppg import STROKE_SCRIPTS
 from pregrasp_jax.policies.scripts import Policy
 from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import Env, make_env, with_task
@@ -27,8 +37,8 @@ NUM_ENVS = 16
 LOOKAHEAD_NUM_ENVS = 4
 """The same for `lookahead`, each of whose decisions simulates `scripts.LOOKAHEAD_CANDIDATES` scenes."""
 
-_PACKING = 50
-"""Scenes between two lines that say how many are packed."""
+_PACKING, _MAKING = 50, 25
+"""Scenes, and objects, between two lines that say how many are packed or made."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +52,7 @@ class Player:
         config: what the environment was made from.
     """
 
-    policy: Policy
+    policy: Policy | Planner
     q_values: Callable[[Any], jax.Array] | None
     env: Env
     config: Config
@@ -63,6 +73,7 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     """
     prepare()
     trained = _load(request.policy)
+    _check_planning(request)
     config = _environment_config(request, Config() if trained is None else trained.config)
     if trained is not None:
         _refuse_other_hand(config, trained.config)
@@ -75,16 +86,20 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
         if done == total or done % _PACKING < 16:
             say(f"packing test scenes: {done} of {total}")
 
-    env = make_env(config, split="test", progress=packed)
+    def made(done: int, total: int) -> None:
+        if done == total or done % _MAKING == 0:
+            say(f"making objects: {done} of {total}")
+
+    env = make_env(config, split="test", progress=packed, making=made)
     if trained is None:
         return Player(_make_script(request.policy, env, config), None, env, config)
-    # Of the task that it was trained on: a window of another size is another input.
-    q_function = make_q_function(config.network, trained.config.task, env.primitive.actions)
-    if not q_function.fits(trained.params):
+    if config.network.mirror and not env.symmetric:
+        say(f"note: the policy averages mirror images, which are no scenes of workspace '{env.workspace.name}'")
+    _, style = _named(request.policy)
+    played = learned.play(env, trained, style, request)
+    if not played.fits:
         raise ValueError(f"policy {trained.origin} does not fit its network in this version of the package")
-    q_values = jax.jit(lambda params, state: q_function.values(params, state.obs, state.scene.target))
-    policy = make_learned(env, q_function.values)(trained.params)
-    return Player(policy, functools.partial(q_values, trained.params), env, config)
+    return Player(played.policy, functools.partial(jax.jit(played.q_values), trained.params), env, config)
 
 
 def run_evaluation(
@@ -118,17 +133,38 @@ def run_evaluation(
         seed=request.seed,
         hull_bank_hash=player.env.bank.content_hash,
         scene_bank_hash=player.env.scenes.content_hash,
+        workspace_hash=player.env.workspace.content_hash,
         wall_seconds=time.monotonic() - start,
+        planning=player.policy.describe() if isinstance(player.policy, Planner) else None,
     )
+
+
+def _named(spec: str) -> tuple[str, str]:
+    """Return which folder (or name) a policy is in, and in what style it is played: `STYLE`, or `STYLE:FOLDER`."""
+    style, colon, folder = spec.partition(":")
+    if spec in STYLES:
+        return PPG, spec
+    return (folder, style) if colon and style in STYLES else (spec, "")
+
+
+def _check_planning(request: EvaluationConfig) -> None:
+    """Refuse a search that has no network to ask, and settings of one that is not wanted."""
+    if request.plan and request.policy in scripts.SCRIPTS:
+        raise ValueError(f"plan = True: policy {request.policy} is a script; allowed is pretrained, or a run folder")
+    if not request.plan and request.planning != PlanningConfig():
+        raise ValueError("planning.* is set, but plan = False; allowed is plan = True with it")
+    request.planning.validate()
 
 
 def _load(spec: str) -> Any:
     """Return the trained policy that `spec` names, None for a script."""
-    if spec in scripts.SCRIPTS:
+    if spec in scripts.SCRIPTS or spec in STROKE_SCRIPTS:
         return None
-    if spec == "pretrained" or Path(spec).exists():
-        return load_policy(spec)
-    names = ", ".join([*scripts.SCRIPTS, "pretrained"])
+    folder, _ = _named(spec)
+    if SHIPPED.get(folder, Path(folder)).exists():
+        return load_policy(folder)
+    shipped = [name for name in ("pretrained", *STYLES) if SHIPPED[_named(name)[0]].exists()]
+    names = ", ".join([*scripts.SCRIPTS, *STROKE_SCRIPTS, *shipped])
     raise ValueError(f"policy {spec} does not exist; allowed: {names}, or a run folder")
 
 
@@ -150,7 +186,7 @@ def _environment_config(request: EvaluationConfig, trained: Config) -> Config:
         assets=request.assets,
         scene=dataclasses.replace(request.scene, test_scenes=test_scenes),
         physics=request.physics,
-        task=dataclasses.replace(trained.task, **_given(request.task)),
+        task=_task(trained.task, request.task),
     )
     return config.validate()
 
@@ -165,13 +201,32 @@ def _refuse_other_hand(config: Config, trained: Config) -> None:
             )
 
 
-def _given(overrides: TaskOverrides) -> dict[str, Any]:
+def _task(trained: TaskConfig, overrides: TaskOverrides) -> TaskConfig:
+    """Return the task of a policy, changed; another place has dimensions of its own."""
+    elsewhere = overrides.workspace not in (None, trained.workspace)
+    place = dataclasses.replace(PlaceConfig() if elsewhere else trained.place, **_given(overrides.place))
+    return dataclasses.replace(trained, **_given(overrides) | {"place": place})
+
+
+def _given(overrides: TaskOverrides | PlaceConfig) -> dict[str, Any]:
     """Return what is to be changed."""
-    return {name: value for name, value in dataclasses.asdict(overrides).items() if value is not None}
+    return {key: value for key, value in vars(overrides).items() if value is not None}
 
 
 def _make_script(name: str, env: Env, config: Config) -> Policy:
     """Return a script; `lookahead` gets an engine of its own, and no camera, which it would render for nothing."""
+    if name in STROKE_SCRIPTS:
+        if not env.primitive.actions.free:
+            raise ValueError(
+                f"policy {name} draws strokes, which task.primitive = {env.task.primitive!r} does not have; allowed is "
+                "--task.robot barrett --task.primitive push_grasp"
+            )
+        return STROKE_SCRIPTS[name](env, config.strokes)
+    if env.primitive.actions.free and name != "random":
+        raise ValueError(
+            f"policy {name} pushes, which task.primitive = {env.task.primitive!r} does not; allowed: random, "
+            f"{', '.join(STROKE_SCRIPTS)}, or a trained policy of strokes"
+        )
     if name == "lookahead":
-        env = with_task(make_env(config, split="test"), camera="orthographic")
+        env = with_task(make_env(config, split="test"), camera="orthographic", sensor="clean")
     return scripts.SCRIPTS[name](env)

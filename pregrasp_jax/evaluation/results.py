@@ -1,7 +1,9 @@
 """Results of an evaluation: episodes, what follows from them, and the file that two runs are compared by."""
 
+import dataclasses
 import json
 from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,7 @@ import numpy as np
 
 from pregrasp_jax import io
 from pregrasp_jax.config import Config, to_dict
-from pregrasp_jax.evaluation.statistics import is_interval, is_number, wilson_interval
+from pregrasp_jax.evaluation.statistics import is_interval, is_number, policy_name, wilson_interval, workspace_of
 from pregrasp_jax.machine import versions
 
 FORMAT = "pregrasp_jax evaluation 1"
@@ -24,6 +26,10 @@ GRASP_FAILED = "grasp_failed"
 """Reason of an episode whose target was in the closing region but not held; the others are `REASONS`."""
 
 
+NOT_ALONE = "target_not_alone"
+"""Reason of an episode whose target was lifted and held, but not as strokes count success: stably, and alone."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Episode:
     """How one scene went.
@@ -34,10 +40,12 @@ class Episode:
         reason: why it ended: `target_in_region` (and grasped, if a grasp was asked for), `grasp_failed`, or
             another of `types.REASONS`.
         success: whether the episode counts as one.
-        motions: executed pushes; one that was refused as unreachable before the hand moved is not a motion.
+        motions: executed pushes, or strokes and retreats; what was refused before the hand moved is none.
+        motions_per_attempt: 2 where an attempt is a stroke and the way back.
         return_: sum of rewards, undiscounted.
         seconds: s, time the robot spent on its motions.
         overflows: physics steps in which the engine had no room for every contact.
+        obstruction: what kept the hand from where it was sent last, of `types.OBSTRUCTIONS`.
     """
 
     scene: int
@@ -48,6 +56,13 @@ class Episode:
     return_: float
     seconds: float
     overflows: int = 0
+    obstruction: str = "none"
+    motions_per_attempt: int = 1
+
+    @property
+    def attempts(self) -> int:
+        """Executed actions."""
+        return self.motions // self.motions_per_attempt
 
     def to_dict(self) -> dict[str, Any]:
         """Return the row of the evaluation file."""
@@ -55,8 +70,10 @@ class Episode:
             "scene": self.scene,
             "target": self.target,
             "reason": self.reason,
+            "obstruction": self.obstruction,
             "success": self.success,
             "motions": self.motions,
+            "attempts": self.attempts,
             "return": round(self.return_, 4),
             "seconds": round(self.seconds, 4),
         }
@@ -83,14 +100,26 @@ class EvaluationResult:
         """Failed episodes by reason, most frequent first."""
         return dict(Counter(episode.reason for episode in self.episodes if not episode.success).most_common())
 
+    @property
+    def obstructions(self) -> dict[str, dict[str, int]]:
+        """What kept the hand from where it was sent in failed episodes, by reason and then by obstruction."""
+        found: dict[str, Counter[str]] = {}
+        for episode in self.episodes:
+            if not episode.success and episode.obstruction != "none":
+                found.setdefault(episode.reason, Counter())[episode.obstruction] += 1
+        return {reason: dict(counts.most_common()) for reason, counts in found.items()}
+
     def summary(self) -> dict[str, Any]:
         """Return the measured keys of the evaluation file, without rows.
 
         Motions are counted over successful episodes (Table I) and are None without one; their standard deviation is
         that of these episodes, not an estimate for more of them. The robot's seconds per motion are over all motions.
+        The lenient rate also counts targets that are held in any other way.
         """
         total = len(self.episodes)
-        motions = [episode.motions for episode in self.episodes if episode.success]
+        motions, attempts = (
+            [getattr(episode, kind) for episode in self.episodes if episode.success] for kind in ("motions", "attempts")
+        )
         executed = sum(episode.motions for episode in self.episodes)
         return {
             "success_rate": self.success_rate,
@@ -98,8 +127,11 @@ class EvaluationResult:
             "in_region_rate": (self.successes + self.failures.get(GRASP_FAILED, 0)) / total,
             "mean_motions": float(np.mean(motions)) if motions else None,
             "std_motions": float(np.std(motions)) if motions else None,
+            "mean_attempts": float(np.mean(attempts)) if attempts else None,
+            "lenient_rate": (self.successes + self.failures.get(NOT_ALONE, 0)) / total,
             "mean_return": sum(episode.return_ for episode in self.episodes) / total,
             "failures": self.failures,
+            "obstructions": self.obstructions,
             "overflows": sum(episode.overflows > 0 for episode in self.episodes),
             "seconds_per_motion": sum(e.seconds for e in self.episodes) / executed if executed else None,
         }
@@ -113,7 +145,9 @@ def evaluation_document(
     seed: int,
     hull_bank_hash: str,
     scene_bank_hash: str,
+    workspace_hash: str,
     wall_seconds: float,
+    planning: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the content of an evaluation file (`pregrasp-jax evaluate --json`).
 
@@ -124,14 +158,20 @@ def evaluation_document(
         seed: of the policy's randomness.
         hull_bank_hash: which objects.
         scene_bank_hash: which scenes; two files can be paired only if both hashes agree.
+        workspace_hash: which place; files of two places are paired only when that is asked for.
         wall_seconds: s, how long the evaluation took on this machine, compilation included.
+        planning: settings of the search that decided and what it took, None without one.
     """
+    from pregrasp_jax.heightmap import get_sensor  # with jax, which readers of evaluations do without
+
     return {
         "format": FORMAT,
         "policy": policy,
+        "planning": None if planning is None else dict(planning),
         "physics": config.physics.engine,
         "object_set": config.assets.object_set,
         "camera": config.task.camera,
+        "sensor": {"name": config.task.sensor, **dataclasses.asdict(get_sensor(config.task.sensor))},
         "workspace": config.task.workspace,
         "robot": config.task.robot,
         "primitive": config.task.primitive,
@@ -142,6 +182,7 @@ def evaluation_document(
         "config_hash": io.content_hash(to_dict(config)),
         "hull_bank_hash": hull_bank_hash,
         "scene_bank_hash": scene_bank_hash,
+        "workspace_hash": workspace_hash,
         "versions": versions(),
         "config": to_dict(config),
         "rows": [episode.to_dict() for episode in result.episodes],
@@ -178,7 +219,11 @@ def _damaged_keys(document: dict[str, Any]) -> list[str]:
     good["success_ci95"] = is_interval(interval)
     good["mean_motions"] = motions == [None, None] or all(map(is_number, motions))
     good["failures"] = isinstance(document.get("failures"), dict)
+    good |= {key: isinstance(document.get(key, ""), str) for key in ("workspace", "workspace_hash")}
+    found = document.get("obstructions", {})
+    good["obstructions"] = isinstance(found, dict) and all(isinstance(counts, dict) for counts in found.values())
     good["rows"] = isinstance(rows, list) and len(rows) > 0 and all(map(_is_row, rows))
+    good["planning"] = document.get("planning") is None or isinstance(document["planning"], dict)
     good["config"] = isinstance(config, dict) and isinstance(config.get("task", {}), dict)
     return [key for key, is_good in good.items() if not is_good]
 
@@ -192,20 +237,36 @@ def _is_row(row: Any) -> bool:
 def format_evaluation(document: dict[str, Any]) -> str:
     """Return the table that `pregrasp-jax evaluate` prints."""
     low, high = document["success_ci95"]
-    title = f"{document['policy']} on {document['episodes']} {document['object_set']} scenes"
+    title = f"{policy_name(document)} on {document['episodes']} {document['object_set']} scenes"
     lines = {
         "success": f"{document['success_rate']:.1%}   95 % interval {low:.1%} to {high:.1%}",
         "target in region": f"{document['in_region_rate']:.1%}",
         "motions": _spread(document["mean_motions"], document["std_motions"]),
         "robot time": _maybe(document["seconds_per_motion"], "{:.2f} s per motion"),
         "mean return": f"{document['mean_return']:.2f}",
-        "failures": ", ".join(f"{reason} {count}" for reason, count in document["failures"].items()) or "none",
+        "failures": ", ".join(_failures(document)) or "none",
     }
+    if planning := document.get("planning"):
+        lines["decision"] = "{seconds:.2f} s, {pushes:.0f} simulated pushes".format(**planning["per_decision"])
+    if document.get("mean_attempts", document["mean_motions"]) != document["mean_motions"]:
+        lines["attempts"] = f"{document['mean_attempts']:.2f} per success"
+    if document.get("lenient_rate", document["success_rate"]) != document["success_rate"]:
+        lines["held in any way"] = f"{document['lenient_rate']:.1%}"
     if document.get("overflows"):
         lines["contacts dropped"] = f"in {document['overflows']} episodes: the limits of the physics engine are too low"
-    settings = f"{document['physics']} physics, {document['camera']} camera, seed {document['seed']}"
+    sensor = document.get("sensor", {}).get("name", "clean")
+    camera = document["camera"] + (" camera" if sensor == "clean" else f" camera, sensor {sensor}")
+    settings = f"{workspace_of(document)}, {document['physics']} physics, {camera}, seed {document['seed']}"
     rows = [f"  {name:<18}{text}" for name, text in lines.items()]
     return "\n".join([f"{title} ({settings}, {document['wall_seconds']:.0f} s)", *rows])
+
+
+def _failures(document: dict[str, Any]) -> Iterator[str]:
+    """Yield reasons with their number, and what was in the way."""
+    for reason, count in document["failures"].items():
+        found = document.get("obstructions", {}).get(reason, {})
+        details = ", ".join(f"{name} {number}" for name, number in found.items())
+        yield f"{reason} {count} ({details})" if details else f"{reason} {count}"
 
 
 def _spread(mean: float | None, std: float | None) -> str:
@@ -230,7 +291,7 @@ def _row(document: dict[str, Any]) -> tuple[str, ...]:
     low, high = document["success_ci95"]
     mean, std = document["mean_motions"], document["std_motions"]
     return (
-        document["policy"],
+        policy_name(document),
         f"{document['episodes']} {document['object_set']}",
         f"{document['success_rate']:.1%}",
         f"{low:.0%} to {high:.0%}",

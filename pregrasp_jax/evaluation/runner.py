@@ -14,13 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
+from pregrasp_jax.evaluation.deliberation import Deliberation
 from pregrasp_jax.evaluation.results import GRASP_FAILED, Episode, EvaluationResult
+from pregrasp_jax.planning.planner import Planner
 from pregrasp_jax.policies.scripts import Policy
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.task.rules import RUNNING
 from pregrasp_jax.task.stages import Stages, make_stages
-from pregrasp_jax.types import REASONS, EnvState, GraspResult
+from pregrasp_jax.types import OBSTRUCTIONS, REASONS, EnvState, GraspResult
 
 EpisodeCallback = Callable[[int, int, int], None]
 """(episodes ended, episodes in all, successes so far) -> None."""
@@ -36,16 +38,18 @@ class _Run(struct.PyTreeNode):
     Attributes:
         state: where it stands.
         reason: () int32, `RUNNING` until the episode ends.
+        obstruction: () int32 index into `OBSTRUCTIONS`, what kept the hand from the end of the last push.
         return_: () float32, rewards so far.
         seconds: () float32 s, time spent on motions so far.
-        action: () int32, the last one decided; -1 before the first.
+        action: the last one decided, in the normal form of the primitive; meaningless before the first.
     """
 
     state: EnvState
     reason: jax.Array
+    obstruction: jax.Array
     return_: jax.Array
     seconds: jax.Array
-    action: jax.Array
+    action: Any
 
 
 class Decision(NamedTuple):
@@ -53,13 +57,13 @@ class Decision(NamedTuple):
 
     Attributes:
         state: unbatched, on the host.
-        action: the chosen push, None after the last one.
+        action: the chosen one in its normal form, a flat index or more, on the host; None after the last one.
         reason: why the episode has ended, as in `Episode.reason`; empty while it goes on.
         success: whether it has ended in one.
     """
 
     state: EnvState
-    action: int | None
+    action: Any
     reason: str = ""
     success: bool = False
 
@@ -83,12 +87,13 @@ class Evaluator:
         self._num_envs = max(num_envs, MIN_BATCH)
         self._start = jax.jit(jax.vmap(self._start_one))
         self._replace = jax.jit(jax.vmap(_where))
-        decide = jax.vmap(self._decide_one, in_axes=(None, 0, None))
-        self._push = make_stages(env.engine, decide, jax.vmap(self._conclude_one))
+        decide, conclude = jax.vmap(self._decide_one, in_axes=(None, 0, None)), jax.vmap(self._conclude_one)
+        self._push = make_stages(env.engine, decide, conclude)
+        self._act = make_stages(env.engine, jax.vmap(self._plan_one), conclude)
         self._grasp = make_stages(env.engine, jax.vmap(self._plan_grasp_one), jax.vmap(self._conclude_grasp_one))
         self._compiled: dict[Hashable, Callable[..., Any]] = {}
 
-    def compile(self, policy: Policy, *, episodes: int) -> None:
+    def compile(self, policy: Policy | Planner, *, episodes: int) -> None:
         """Compile now what `run` compiles on its way otherwise; it may take minutes.
 
         Args:
@@ -98,13 +103,17 @@ class Evaluator:
         num_envs = self._batch_size(episodes)
         runs = self._program(self._start, np.zeros(num_envs, np.int32)).out_info
         enclosed = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((self._num_envs, *leaf.shape[1:]), leaf.dtype), runs)
-        self._program(self._push, _bound(policy), runs, jax.random.key(0))
+        if isinstance(policy, Planner):
+            self._program(self._act, runs, np.zeros(num_envs, np.int32))
+        else:
+            self._program(self._push, _bound(policy), runs, jax.random.key(0))
         self._program(self._replace, np.zeros(num_envs, bool), runs, runs)
-        self._program(self._grasp, enclosed.state, np.ones(self._num_envs, bool))
+        if self._env.rules.asks_for_grasp:
+            self._program(self._grasp, enclosed.state, np.ones(self._num_envs, bool))
 
     def run(
         self,
-        policy: Policy,
+        policy: Policy | Planner,
         *,
         episodes: int,
         seed: int = 0,
@@ -145,7 +154,9 @@ class Evaluator:
         finish(self._grasp_all(enclosed))
         return EvaluationResult(tuple(sorted(finished, key=lambda episode: episode.scene)))
 
-    def play(self, policy: Policy, scene: int, *, seed: int = 0, with_grasp: bool = True) -> Iterator[Decision]:
+    def play(
+        self, policy: Policy | Planner, scene: int, *, seed: int = 0, with_grasp: bool = True
+    ) -> Iterator[Decision]:
         """Yield the decisions of one scene, the last of which is the end of the episode: exactly what `run` counts.
 
         Args:
@@ -154,27 +165,27 @@ class Evaluator:
             seed: as in `run`.
             with_grasp: as in `run`.
         """
-        policy, key = _bound(policy), jax.random.key(seed)
+        push = self._pusher(policy, jax.random.key(seed))
         runs = self._call(self._start, np.full(MIN_BATCH, scene, np.int32))
         run = _first(runs)
         while run.reason == RUNNING:
-            runs, before = self._call(self._push, policy, runs, key), run
+            runs, before = push(runs), run
             run = _first(runs)
-            yield Decision(before.state, int(run.action))
+            yield Decision(before.state, run.action)
         (episode,) = self._grasp_all([run]) if self._asks_for_grasp(run, with_grasp) else [self._episode(run)]
         yield Decision(run.state, None, episode.reason, episode.success)
 
     def _asks_for_grasp(self, run: _Run, with_grasp: bool) -> bool:
-        return with_grasp and int(run.reason) in self._env.rules.successes
+        return with_grasp and self._env.rules.asks_for_grasp and int(run.reason) in self._env.rules.successes
 
-    def _run_to_ends(self, policy: Policy, episodes: int, key: jax.Array) -> Iterator[_Run]:
+    def _run_to_ends(self, policy: Policy | Planner, episodes: int, key: jax.Array) -> Iterator[_Run]:
         """Yield every scene when its pushes have ended, as host arrays."""
-        policy, num_envs = _bound(policy), self._batch_size(episodes)
+        push, num_envs = self._pusher(policy, key), self._batch_size(episodes)
         waiting = iter(range(num_envs, episodes))
         busy = np.arange(num_envs) < episodes
         runs = self._call(self._start, np.where(busy, np.arange(num_envs), 0).astype(np.int32))
         while busy.any():
-            runs = self._call(self._push, policy, runs, key)
+            runs = push(runs)
             ended = np.flatnonzero(busy & (np.asarray(runs.reason) != RUNNING))
             if ended.size == 0:
                 continue
@@ -187,11 +198,21 @@ class Evaluator:
                 fresh = self._call(self._start, np.maximum(following, 0))
                 runs = self._call(self._replace, following >= 0, fresh, runs)
 
+    def _pusher(self, policy: Policy | Planner, key: jax.Array) -> Callable[[_Run], _Run]:
+        """Return the function that lets a policy decide once more in every scene of a batch, and pushes."""
+        if isinstance(policy, Planner):
+            deliberation = Deliberation(policy, key)
+            return lambda runs: self._call(
+                self._act, runs, deliberation(runs.state, np.asarray(runs.reason) == RUNNING)
+            )
+        bound = _bound(policy)
+        return lambda runs: self._call(self._push, bound, runs, key)
+
     def _batch_size(self, episodes: int) -> int:
         """Return how many scenes are pushed side by side."""
         return max(min(self._num_envs, episodes), MIN_BATCH)
 
-    def _program(self, function: Any, *args: Any) -> Callable[..., Any]:
+    def _program(self, function: Any, *args: Any) -> Any:
         """Return a jitted or staged function compiled for arguments like these; it is compiled once."""
         leaves, structure = jax.tree.flatten(args)
         kind = (function, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
@@ -215,6 +236,7 @@ class Evaluator:
     def _episode(self, run: _Run, grasp: GraspResult | None = None) -> Episode:
         scene, reason, overflows = run.state.scene, REASONS[int(run.reason)], run.state.physics_obs.overflows
         success = int(run.reason) in self._env.rules.successes
+        obstruction = run.obstruction if grasp is None else grasp.obstruction
         if grasp is not None:
             success = bool(grasp.held)
             if not success:
@@ -225,35 +247,47 @@ class Evaluator:
             target=self._env.bank.names[int(scene.object_ids[scene.target])],
             reason=reason,
             success=success,
-            motions=int(run.state.num_pushes),
+            motions=int(run.state.num_pushes) * self._env.primitive.motions,
+            motions_per_attempt=self._env.primitive.motions,
             return_=float(run.return_),
             seconds=float(run.seconds),
             overflows=int(overflows),
+            obstruction=OBSTRUCTIONS[int(obstruction)],
         )
 
     def _start_one(self, index: jax.Array) -> _Run:
-        return _Run(self._env.reset_to(index), jnp.int32(RUNNING), jnp.float32(0.0), jnp.float32(0.0), jnp.int32(-1))
+        zero, none = jnp.float32(0.0), jnp.int32(OBSTRUCTIONS.index("none"))
+        blank = self._env.primitive.normal(jnp.int32(-1))
+        return _Run(self._env.reset_to(index), jnp.int32(RUNNING), none, zero, zero, blank)
 
     def _decide_one(self, policy: Policy, run: _Run, key: jax.Array) -> tuple[Any, Plan, Any]:
-        """Let the policy decide, and plan; an ended run stays where it is."""
+        """Let the policy decide, and plan."""
         state = run.state
         key = jax.random.fold_in(jax.random.fold_in(key, state.scene_index), state.num_pushes)
-        action = policy(state, key)
-        plan = self._env.plan(state, action).unless(run.reason != RUNNING, "no_ik")
-        return state.physics, plan, run.replace(action=action)
+        return self._plan_one(run, self._env.primitive.normal(policy(state, key)))
+
+    def _plan_one(self, run: _Run, action: jax.Array) -> tuple[Any, Plan, Any]:
+        """Plan a push that is decided; an ended run stays where it is."""
+        plan = self._env.plan(run.state, action).unless(run.reason != RUNNING, "no_ik")
+        return run.state.physics, plan, run.replace(action=action)
 
     def _conclude_one(self, run: _Run, plan: Plan, physics: Any) -> _Run:
         """Return the run after a push; an ended run stays as it is."""
         state, result = self._env.conclude(run.state, plan, physics)
-        pushed = _Run(state, result.reason, run.return_ + result.reward, run.seconds + result.seconds, run.action)
+        pushed = run.replace(
+            state=state,
+            reason=result.reason,
+            obstruction=result.outcome.obstruction,
+            return_=run.return_ + result.reward,
+            seconds=run.seconds + result.seconds,
+        )
         return _where(run.reason == RUNNING, pushed, run)
 
     def _plan_grasp_one(self, state: EnvState, execute: jax.Array) -> tuple[Any, Plan, Any]:
         return state.physics, self._env.plan_grasp(state).unless(~execute, "no_ik"), state
 
     def _conclude_grasp_one(self, state: EnvState, plan: Plan, physics: Any) -> GraspResult:
-        del plan
-        return self._env.conclude_grasp(state, physics)
+        return self._env.conclude_grasp(state, plan, physics)
 
 
 def evaluate_policy(

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, TypeGuard
 
+from pregrasp_jax.config import TaskConfig, flatten
+
 _Z95 = 1.959963984540054
 """Normal quantile of a two-sided 95 % interval."""
 
@@ -15,6 +17,11 @@ _OUTCOMES = ("both", "only A", "only B", "neither")
 
 _SAME = ("object_set", "scene_bank_hash", "hull_bank_hash")
 """What two evaluations must share before their episodes can be paired."""
+
+
+def policy_name(document: Mapping[str, Any]) -> str:
+    """Return what decided in an evaluation: a policy, or a search that asks it."""
+    return document["policy"] + (" with planning" if document.get("planning") else "")
 
 
 def is_number(value: Any) -> TypeGuard[float]:
@@ -135,12 +142,23 @@ class Comparison:
         return asdict(self)
 
 
-def compare(a: Mapping[str, Any], b: Mapping[str, Any]) -> Comparison:
+def compare(a: Mapping[str, Any], b: Mapping[str, Any], *, across_workspaces: bool = False) -> Comparison:
     """Pair two evaluations (the JSON of `pregrasp-jax evaluate`) by scene and test their difference.
 
+    Args:
+        a: one evaluation.
+        b: another.
+        across_workspaces: the same scenes may have been run in two places.
+
     Raises:
-        ValueError: the two did not run the same scenes with the same targets; one line names what differs.
+        ValueError: the two did not run the same scenes with the same targets, or not in one place; one line names what
+            differs.
     """
+    if not across_workspaces and (places := _places(a, b)):
+        raise ValueError(
+            f"cannot pair: workspace is {places[0]} in the first file and {places[1]} in the second; allowed are equal "
+            "ones, or --across-workspaces True"
+        )
     for key in _SAME:
         if a[key] != b[key]:
             raise ValueError(
@@ -156,6 +174,22 @@ def compare(a: Mapping[str, Any], b: Mapping[str, Any]) -> Comparison:
                 f"{rows_b[scene]['target']} in the second"
             )
     return _compare_pairs(a, b, [(rows_a[scene]["success"], rows_b[scene]["success"]) for scene in sorted(rows_a)])
+
+
+def workspace_of(document: Mapping[str, Any]) -> str:
+    """Return the name of the place of an evaluation; before there were several, all were of the open table."""
+    return document.get("workspace", TaskConfig().workspace)
+
+
+def _places(a: Mapping[str, Any], b: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the places of two evaluations if they differ, in name or dimensions; older files name none."""
+    names = tuple(map(workspace_of, (a, b)))
+    hashes = tuple(document.get("workspace_hash", "") for document in (a, b))
+    if names[0] != names[1]:
+        return names
+    if all(hashes) and hashes[0] != hashes[1]:
+        return tuple(f"{name} {digest}" for name, digest in zip(names, hashes, strict=True))
+    return ()
 
 
 def _by_scene(rows: Iterable[Mapping[str, Any]]) -> dict[int, Mapping[str, Any]]:
@@ -174,7 +208,7 @@ def _compare_pairs(a: Mapping[str, Any], b: Mapping[str, Any], pairs: list[tuple
     )
     trials = len(pairs)
     return Comparison(
-        policies=(a["policy"], b["policy"]),
+        policies=(policy_name(a), policy_name(b)),
         episodes=trials,
         success_rates=((both + only_a) / trials, (both + only_b) / trials),
         success_ci95=(wilson_interval(both + only_a, trials), wilson_interval(both + only_b, trials)),
@@ -191,11 +225,17 @@ def _compare_pairs(a: Mapping[str, Any], b: Mapping[str, Any], pairs: list[tuple
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
     """Yield one line for every setting in which two paired evaluations differ."""
+    if places := _places(a, b):
+        yield f"workspace: {places[0]} | {places[1]}"
     for key in ("camera", "physics", "seed"):
         if a[key] != b[key]:
             yield f"{key}: {a[key]} | {b[key]}"
-    tasks = [document.get("config", {}).get("task", {}) for document in (a, b)]
-    for key in sorted(set(tasks[0]) & set(tasks[1]) - {"camera"}):
+    searches = [(document.get("planning") or {}).get("settings", {}) for document in (a, b)]
+    for key in sorted(set(searches[0]) | set(searches[1])):
+        if searches[0].get(key) != searches[1].get(key):
+            yield f"planning.{key}: {searches[0].get(key, 'off')} | {searches[1].get(key, 'off')}"
+    tasks = [flatten(document.get("config", {}).get("task", {})) for document in (a, b)]
+    for key in sorted(set(tasks[0]) & set(tasks[1]) - {"camera", "workspace"}):
         if tasks[0][key] != tasks[1][key]:
             yield f"task.{key}: {tasks[0][key]} | {tasks[1][key]}"
 

@@ -1,5 +1,7 @@
 """From the state of a scene to what the network reads; the same functions serve training and deployment."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +29,7 @@ from pregrasp_jax.types import (
 SEGMENTATION = {"table": 0, "obstacle": 1, "target": 2, "robot": 3}
 """Pixel values of the fused segmentation (Sec. III-B)."""
 
-_MIN_STD = 1e-3
+MIN_STD = 1e-3
 """m; floor of the standard deviation, so that an empty table gives zeros."""
 
 
@@ -85,21 +87,28 @@ def object_hulls(bank: HullBank, object_ids: jax.Array, poses: jax.Array) -> Hul
     return HullInstances(planes=planes, vertices=vertices, labels=labels, present=present.ravel())
 
 
-def observe(hulls: HullInstances, hand: HandPose, *, camera: str | Camera = "orthographic") -> Observation:
+def observe(
+    hulls: HullInstances,
+    hand: HandPose,
+    *,
+    camera: str | Camera = "orthographic",
+    look: Callable[[HullInstances, Camera], tuple[jax.Array, jax.Array]] = pinhole,
+) -> Observation:
     """Return what a policy is told: what a camera sees, and where the hand has been sent.
 
     Args:
         hulls: what stands on the table, robot included (unbatched), from `scene_hulls`.
         hand: commanded end of the last push.
         camera: ``orthographic``, ``pinhole`` for the overhead camera of the MJCF, or a pinhole camera.
+        look: what a pinhole camera makes of hulls; `sensor.sense` is another.
 
     Raises:
         ValueError: another name.
     """
     if isinstance(camera, Camera):
-        height, instance_ids = pinhole(hulls, camera)
+        height, instance_ids = look(hulls, camera)
     elif camera == "pinhole":
-        height, instance_ids = pinhole(hulls, overhead_camera())
+        height, instance_ids = look(hulls, overhead_camera())
     elif camera == "orthographic":
         height, instance_ids = orthographic(hulls)
     else:
@@ -143,7 +152,7 @@ def network_input(obs: Observation, target_slot: jax.Array) -> jax.Array:
     """
     assert obs.height.shape == obs.instance_ids.shape and obs.height.ndim == 2, obs.height.shape
     height = grid.dequantize_height(obs.height)
-    normalized = (height - height.mean()) / jnp.maximum(height.std(), _MIN_STD)
+    normalized = (height - height.mean()) / jnp.maximum(height.std(), MIN_STD)
     segmentation = fuse_segmentation(obs.instance_ids, target_slot).astype(jnp.float32)
     return jnp.stack([normalized, segmentation / max(SEGMENTATION.values())], axis=-1)
 

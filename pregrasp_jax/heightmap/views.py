@@ -118,13 +118,56 @@ def pinhole(hulls: HullInstances, camera: Camera) -> tuple[jax.Array, jax.Array]
         Sec. III-B of the paper.
     """
     depth, labels = render_pinhole(hulls, camera)
-    points = unproject(depth, camera)
+    return project_upward(unproject(depth, camera), labels)
+
+
+def project_upward(
+    points: jax.Array, labels: jax.Array, valid: jax.Array | None = None, *, cell: str = "max"
+) -> tuple[jax.Array, jax.Array]:
+    """Project points upward to the grid.
+
+    Args:
+        points: [..., 3] m in the world.
+        labels: [...] uint8.
+        valid: [...] bool, which of them are points at all; None is all.
+        cell: which of the points above a cell is its height: `max`, the `second` highest (the only one where there is
+            but one), or the `median` (of an even number the higher one).
+
+    Returns:
+        height [H, W] float32 m and the label of that point; cells without a point are table.
+    """
     row, col = grid.world_to_cell(points[..., :2])
     on_grid = (jnp.minimum(row, col) >= 0) & (jnp.maximum(row, col) < grid.GRID_SIZE)
-    cell = jnp.where(on_grid, row * grid.GRID_SIZE + col, grid.GRID_SIZE**2)
-    keys = encode_key(points[..., 2], labels, HEIGHT_LIMIT)
-    cells = jnp.zeros(grid.GRID_SIZE**2, jnp.int32).at[cell.ravel()].max(keys.ravel(), mode="drop")
-    return decode_key(cells.reshape(grid.GRID_SIZE, grid.GRID_SIZE), HEIGHT_LIMIT)
+    on_grid &= True if valid is None else valid
+    num_cells = grid.GRID_SIZE**2
+    index = jnp.where(on_grid, row * grid.GRID_SIZE + col, num_cells).ravel()
+    keys = encode_key(points[..., 2], labels, HEIGHT_LIMIT).ravel()
+    if cell == "median":
+        chosen = _median_keys(index, keys, num_cells)
+    else:
+        chosen = jnp.zeros(num_cells, jnp.int32).at[index].max(keys, mode="drop")
+        if cell == "second":
+            chosen = _second_keys(index, keys, chosen)
+    return decode_key(chosen.reshape(grid.GRID_SIZE, grid.GRID_SIZE), HEIGHT_LIMIT)
+
+
+def _second_keys(index: jax.Array, keys: jax.Array, highest: jax.Array) -> jax.Array:
+    """Return the second largest of the keys [P] of every cell, given the largest [C]; that one where it is alone."""
+    order = jnp.arange(len(keys))
+    largest = keys == jnp.append(highest, -1)[index]
+    winner = jnp.full(len(highest), -1).at[index].max(jnp.where(largest, order, -1), mode="drop")
+    rest = jnp.where(order == jnp.append(winner, -1)[index], -1, keys)
+    second = jnp.full(len(highest), -1).at[index].max(rest, mode="drop")
+    return jnp.where(second < 0, highest, second)
+
+
+def _median_keys(index: jax.Array, keys: jax.Array, num_cells: int) -> jax.Array:
+    """Return the median of the keys [P] of every cell, the upper one of two; 0 where there is none."""
+    cells, keys = jax.lax.sort((index, keys), num_keys=2)
+    first = jnp.searchsorted(cells, jnp.arange(num_cells + 1))
+    count = first[1:] - first[:-1]
+    middle = keys[jnp.minimum(first[:-1] + count // 2, len(keys) - 1)]
+    return jnp.where(count > 0, middle, 0)
 
 
 def unproject(depth: jax.Array, camera: Camera) -> jax.Array:

@@ -53,6 +53,7 @@ def add_hindsight(replay: Replay, eligible: jax.Array, rules: Rules) -> Replay:
         terminated=verdicts.terminated,
         reason=verdicts.reason,
         hindsight=jnp.ones_like(valid),
+        next_value=jnp.where(verdicts.terminated, 0.0, replay_lib.UNKNOWN),
     )
     valid = valid & (found & episodes.ended)[:, None]
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), relabelled)

@@ -16,7 +16,7 @@ import optax
 from pregrasp_jax.config import LearnerConfig, ReplayConfig
 from pregrasp_jax.learning import replay as replay_lib
 from pregrasp_jax.learning.q_function import Params, QFunction
-from pregrasp_jax.learning.replay import Batch, Replay
+from pregrasp_jax.learning.replay import UNKNOWN, Batch, Replay
 from pregrasp_jax.types import HandPose
 
 MaskFn = Callable[[HandPose], jax.Array]
@@ -101,12 +101,12 @@ def update(
     successes: Sequence[int],
     optimizer: optax.GradientTransformation,
     config: LearnerConfig,
-) -> tuple[LearnerState, jax.Array, dict[str, jax.Array]]:
+) -> tuple[LearnerState, jax.Array, jax.Array, dict[str, jax.Array]]:
     """Take one gradient step.
 
     Args:
         state: what changes.
-        batch: B transitions; the gradient of each flows through the pixel of its action only.
+        batch: B states, each with K pushes; the gradient flows through the pixels of these pushes only.
         q: the network.
         mask_fn: which actions are allowed.
         successes: reasons that count as success.
@@ -114,16 +114,22 @@ def update(
         config: discount, polyak, loss.
 
     Returns:
-        The next state, TD errors [B] (signed) for the priorities, and metrics () each.
+        The next state, TD errors [B, K] (signed), 0 where nothing is known of the next state, the values [B, K] of the
+        next states, `UNKNOWN` where they are not, and metrics () each.
     """
     masks = jax.vmap(mask_fn)(batch.next_hand)
-    values = jax.vmap(max_q)(q.apply(state.target_params, batch.next_inputs), masks)
+    fresh = jax.vmap(max_q)(q.apply(state.target_params, batch.next_inputs), masks)
+    values = jnp.where(batch.drawn, fresh[:, None], batch.next_values)
+    known = values > UNKNOWN
     discounted = functools.partial(td_target, discount=config.discount)
-    targets = jax.vmap(discounted)(batch.reward, batch.terminated, values)
+    targets = jax.vmap(jax.vmap(discounted))(batch.reward, batch.terminated, jnp.where(known, values, 0.0))
 
     def loss_fn(params: Params) -> tuple[jax.Array, jax.Array]:
-        errors = jax.vmap(td_error)(q.at(params, batch.inputs, batch.action), targets)
-        return jnp.mean(batch.importance_weights * huber(errors, delta=config.huber_delta)), errors
+        # Mapped over pushes only: what the network does with the state is done once.
+        taken = jax.vmap(q.at, (None, None, 1), 1)(params, batch.inputs, batch.action)
+        errors = jnp.where(known, jax.vmap(jax.vmap(td_error))(taken, targets), 0.0)
+        losses = batch.importance_weights[:, None] * huber(errors, delta=config.huber_delta)
+        return jnp.sum(losses) / jnp.sum(known), errors
 
     (loss, errors), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.params)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
@@ -134,7 +140,7 @@ def update(
         opt_state=opt_state,
         gradient_steps=state.gradient_steps + 1,
     )
-    return next_state, errors, _metrics(batch, loss, errors, targets, grads, successes)
+    return next_state, errors, values, _metrics(batch, loss, errors, targets, known, grads, successes)
 
 
 def sample_and_update(
@@ -149,7 +155,7 @@ def sample_and_update(
     split_fn: Callable[[Batch], Batch] = lambda batch: batch,
     **update_options: Any,
 ) -> tuple[LearnerState, Replay, dict[str, jax.Array]]:
-    """Sample, update, set priorities.
+    """Sample, update, keep priorities and values.
 
     Args:
         state: of the learner.
@@ -173,9 +179,9 @@ def sample_and_update(
     batch = split_fn(batch)
     inputs, action = q.augment(augment_key, batch.inputs, batch.action)
     batch = batch.replace(inputs=inputs, action=action)
-    state, errors, metrics = update(state, batch, q=q, config=config, **update_options)
+    state, errors, values, metrics = update(state, batch, q=q, config=config, **update_options)
     exponent = replay_config.priority_exponent
-    return state, replay_lib.set_priorities(replay, batch.rows, errors, priority_exponent=exponent), metrics
+    return state, replay_lib.learned(replay, batch, errors, values, priority_exponent=exponent), metrics
 
 
 def _metrics(
@@ -183,21 +189,26 @@ def _metrics(
     loss: jax.Array,
     errors: jax.Array,
     targets: jax.Array,
+    known: jax.Array,
     grads: Params,
     successes: Sequence[int],
 ) -> dict[str, jax.Array]:
-    succeeded = jnp.any(batch.reason[:, None] == jnp.array(successes)[None], axis=-1)
+    succeeded = jnp.any(batch.reason[..., None] == jnp.array(successes)[None, None], axis=-1)
     approached = ~succeeded & (batch.reward > 0)
+
+    def mean(values: jax.Array) -> jax.Array:
+        return jnp.sum(jnp.where(known, values, 0.0)) / jnp.sum(known)
+
     return {
         "train/loss": loss,
-        "train/td_error": jnp.mean(jnp.abs(errors)),
-        "train/target_mean": jnp.mean(targets),
-        "train/target_min": jnp.min(targets),
-        "train/target_max": jnp.max(targets),
-        "train/q_taken": jnp.mean(targets + errors),
+        "train/td_error": mean(jnp.abs(errors)),
+        "train/target_mean": mean(targets),
+        "train/target_min": jnp.min(jnp.where(known, targets, jnp.inf)),
+        "train/target_max": jnp.max(jnp.where(known, targets, -jnp.inf)),
+        "train/q_taken": mean(targets + errors),
         "train/grad_norm": optax.tree.norm(grads),
-        "train/share_success": jnp.mean(succeeded.astype(jnp.float32)),
-        "train/share_approach": jnp.mean(approached.astype(jnp.float32)),
-        "train/share_nothing": jnp.mean((~succeeded & ~approached).astype(jnp.float32)),
+        "train/share_success": mean(succeeded.astype(jnp.float32)),
+        "train/share_approach": mean(approached.astype(jnp.float32)),
+        "train/share_nothing": mean((~succeeded & ~approached).astype(jnp.float32)),
         "train/share_hindsight": jnp.mean(batch.hindsight.astype(jnp.float32)),
     }

@@ -86,10 +86,10 @@ class QFunction:
         return jnp.take_along_axis(q, choice[:, None], axis=1)[:, 0]
 
     def augment(self, key: jax.Array, inputs: Any, action: jax.Array) -> tuple[Any, jax.Array]:
-        """Reflect each of B scenes and its push [B] with probability 1/2, if there is a `mirror_fn`."""
+        """Reflect each of B scenes and its pushes [B, ...] with probability 1/2, if there is a `mirror_fn`."""
         if self.mirror_fn is None:
             return inputs, action
-        mirrored = jax.random.bernoulli(key, shape=action.shape)
+        mirrored = jax.random.bernoulli(key, shape=action.shape[:1])
         reflection = self.mirror_fn(inputs), self.actions.mirror(action)
         choose = jax.vmap(jnp.where, in_axes=(0, 0, 0))
         return jax.tree.map(functools.partial(choose, mirrored), reflection, (inputs, action))

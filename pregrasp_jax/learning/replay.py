@@ -5,6 +5,9 @@ observations of the episode that they relabel. What is forgotten is decided by t
 priority, for ever, in the same `add` that overwrites one of its observations, and the ring of rows is long enough
 never to overwrite a row that is still alive.
 
+Pushes from one state share its picture, so one pass of the network can learn from all of them. Rows name their
+siblings, and keep the value of the state that they lead to as it was when they were last drawn themselves.
+
 Source: Schaul et al. 2016 (proportional variant); Sec. III-E of the paper.
 """
 
@@ -21,6 +24,9 @@ from pregrasp_jax.types import HandPose, Observation, Outcome
 
 MIN_TD_ERROR = 1e-3
 """Added to |TD error|, so that no transition is forgotten because it was once predicted well."""
+
+UNKNOWN = float("-inf")
+"""Value of a next state that nobody has looked at yet."""
 
 InputFn = Callable[[Observation, jax.Array], Any]
 """``(observation, goal slot ())`` -> what the network reads, a pytree, unbatched; [H, W, 2] for the paper's."""
@@ -69,6 +75,8 @@ class Rows(struct.PyTreeNode):
         reason: int32 index into `REASONS`.
         hindsight: bool, `goal` was not the target when the push was made.
         outcome: what the push did, for any goal.
+        siblings: [..., K] int32 rows of pushes from the same state for the same goal, this one included; -1 for none.
+        next_value: float32 value of the next state when the row was last drawn; 0 if it terminated, else `UNKNOWN`.
     """
 
     obs_slot: jax.Array
@@ -80,6 +88,8 @@ class Rows(struct.PyTreeNode):
     reason: jax.Array
     hindsight: jax.Array
     outcome: Outcome
+    siblings: jax.Array
+    next_value: jax.Array
 
 
 class Episodes(struct.PyTreeNode):
@@ -120,46 +130,56 @@ class Replay(struct.PyTreeNode):
     hindsight_rows_written: jax.Array
 
     @property
+    def num_siblings(self) -> int:
+        """Return K, how many pushes from one state are drawn together."""
+        return self.rows.siblings.shape[1]
+
+    @property
     def num_alive(self) -> jax.Array:
         """Return the number () int32 of rows that can be sampled."""
         return jnp.sum(self.priorities.leaves > 0)
 
 
 class Batch(struct.PyTreeNode):
-    """B sampled transitions.
+    """B sampled transitions, each with its siblings: K pushes from one state.
 
     Attributes:
-        inputs: network input before the push, fused for the row's goal; leading axis B.
-        next_inputs: the same after it.
-        action: [B] int32.
-        reward: [B] float32.
-        terminated: [B] bool.
-        reason: [B] int32 index into `REASONS`.
-        next_hand: where the hand had been sent after the push; leaves have the leading axis B.
+        inputs: network input before the pushes, fused for the row's goal; leading axis B.
+        next_inputs: the same after the push that was drawn.
+        next_hand: where the hand had been sent after that push; leaves have the leading axis B.
         importance_weights: [B] float32 in (0, 1], largest 1.
         hindsight: [B] bool.
-        rows: [B] int32, for `set_priorities`.
+        rows: [B, K] int32, for `set_priorities`; -1 for none.
+        drawn: [B, K] bool, which one was drawn; its next state is the only one that is looked at.
+        next_values: [B, K] float32 of the next states when they were last looked at, `UNKNOWN` if never.
+        action: [B, K] int32.
+        reward: [B, K] float32.
+        terminated: [B, K] bool.
+        reason: [B, K] int32 index into `REASONS`.
     """
 
     inputs: Any
     next_inputs: Any
-    action: jax.Array
-    reward: jax.Array
-    terminated: jax.Array
-    reason: jax.Array
     next_hand: HandPose
     importance_weights: jax.Array
     hindsight: jax.Array
     rows: jax.Array
+    drawn: jax.Array
+    next_values: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    reason: jax.Array
 
 
-def init(steps: Any, *, capacity: int, max_pushes: int) -> Replay:
+def init(steps: Any, *, capacity: int, max_pushes: int, num_siblings: int = 1) -> Replay:
     """Return an empty memory.
 
     Args:
         steps: a `Steps` of E scenes, or its shapes (`jax.eval_shape`).
         capacity: observations, 20 kB each.
         max_pushes: longest episode.
+        num_siblings: K pushes from one state that are drawn together: 1, or E over the number of real scenes.
 
     Raises:
         ValueError: an episode could lose its first observation before it ends.
@@ -188,6 +208,8 @@ def init(steps: Any, *, capacity: int, max_pushes: int) -> Replay:
         reason=index,
         hindsight=flag,
         outcome=zeros(num_rows, steps.outcome),
+        siblings=jnp.full((num_rows, num_siblings), -1, jnp.int32),
+        next_value=jnp.zeros(num_rows),
     )
     episodes = Episodes(
         obs_slot=jnp.zeros(num_envs, jnp.int32),
@@ -228,8 +250,14 @@ def add(replay: Replay, steps: Steps) -> Replay:
         reason=steps.reason.astype(jnp.int32),
         hindsight=jnp.zeros(num_envs, bool),
         outcome=steps.outcome,
+        siblings=jnp.zeros((num_envs, replay.num_siblings), jnp.int32),
+        next_value=jnp.where(steps.terminated, 0.0, UNKNOWN),
     )
     replay, row_slots = append(replay, rows, jnp.ones(num_envs, bool))
+    if replay.num_siblings > 1:
+        # Scenes come first, then branch by branch: see `training.collect.Experience`.
+        siblings = row_slots.reshape(replay.num_siblings, -1).T[steps.root]
+        replay = replay.replace(rows=replay.rows.replace(siblings=replay.rows.siblings.at[row_slots].set(siblings)))
     position = jnp.where(fresh, 0, replay.episodes.length)
     episodes = Episodes(
         obs_slot=rows.next_obs_slot,
@@ -241,13 +269,15 @@ def add(replay: Replay, steps: Steps) -> Replay:
 
 
 def append(replay: Replay, rows: Rows, valid: jax.Array) -> tuple[Replay, jax.Array]:
-    """Write the rows [K] that are `valid` [K], with the largest priority in the memory.
+    """Write the rows [K] that are `valid` [K], with the largest priority in the memory and without siblings.
 
     Returns:
         The memory and the slots [K] int32 of the rows; the number of slots (out of range) where not valid.
     """
     num_slots = replay.priorities.capacity
     slots = _ring_slots(replay.rows_written, valid, num_slots)
+    alone = jnp.arange(replay.num_siblings)[None] == 0
+    rows = rows.replace(siblings=jnp.where(alone, slots[:, None], -1))
     largest = jnp.max(replay.priorities.leaves)
     priority = jnp.where(rows.outcome.diverged, 0.0, jnp.where(largest > 0, largest, 1.0))
     replay = replay.replace(
@@ -262,7 +292,9 @@ def append(replay: Replay, rows: Rows, valid: jax.Array) -> tuple[Replay, jax.Ar
 def sample(
     replay: Replay, key: jax.Array, *, batch_size: int, importance_exponent: jax.Array | float, input_fn: InputFn
 ) -> Batch:
-    """Draw transitions in proportion to their priorities; at least one row must be alive.
+    """Draw transitions in proportion to their priorities, with their siblings; at least one row must be alive.
+
+    A state is drawn as often as all of its pushes together, which is what the importance weights make good for.
 
     Args:
         replay: the memory.
@@ -272,28 +304,60 @@ def sample(
         input_fn: fuses an observation for a goal.
     """
     slots = sum_tree.sample(replay.priorities, key, batch_size)
-    rows = jax.tree.map(lambda leaf: leaf[slots], replay.rows)
+    row = jax.tree.map(lambda leaf: leaf[slots], replay.rows)
+    # A sibling is as alive as the row that was drawn, unless it diverged.
+    priorities = jnp.where(row.siblings >= 0, replay.priorities.leaves[row.siblings], 0.0)
+    rows = jnp.where(priorities > 0, row.siblings, -1)
+    pushes = jax.tree.map(lambda leaf: leaf[rows], replay.rows)
 
     def inputs(obs_slots: jax.Array) -> Any:
         images = jax.tree.map(lambda leaf: leaf[obs_slots], replay.observations)
-        return jax.vmap(input_fn)(images, rows.goal)
+        return jax.vmap(input_fn)(images, row.goal)
 
     return Batch(
-        inputs=inputs(rows.obs_slot),
-        next_inputs=inputs(rows.next_obs_slot),
-        action=rows.action,
-        reward=rows.reward,
-        terminated=rows.terminated,
-        reason=rows.reason,
-        next_hand=jax.tree.map(lambda leaf: leaf[rows.next_obs_slot], replay.observations.hand),
-        importance_weights=_importance_weights(replay, slots, importance_exponent),
-        hindsight=rows.hindsight,
-        rows=slots,
+        inputs=inputs(row.obs_slot),
+        next_inputs=inputs(row.next_obs_slot),
+        next_hand=jax.tree.map(lambda leaf: leaf[row.next_obs_slot], replay.observations.hand),
+        importance_weights=_importance_weights(jnp.sum(priorities, axis=1), importance_exponent),
+        hindsight=row.hindsight,
+        rows=rows,
+        drawn=rows == slots[:, None],
+        next_values=jnp.where(rows >= 0, pushes.next_value, UNKNOWN),
+        action=pushes.action,
+        reward=pushes.reward,
+        terminated=pushes.terminated,
+        reason=pushes.reason,
     )
 
 
+def learned(
+    replay: Replay, batch: Batch, td_errors: jax.Array, values: jax.Array, *, priority_exponent: float
+) -> Replay:
+    """Keep what an update has found out about a batch.
+
+    Priorities become (|TD error| + MIN_TD_ERROR)^priority_exponent; dead rows stay dead.
+
+    Args:
+        replay: the memory.
+        batch: what was drawn from it.
+        td_errors: [B, K], counted where `values` are known.
+        values: [B, K] of the next states, `UNKNOWN` where they are not.
+        priority_exponent: alpha.
+    """
+    known = (batch.rows >= 0) & (values > UNKNOWN)
+    rows = jnp.where(known, batch.rows, replay.priorities.capacity).ravel()
+    replay = set_priorities(replay, rows, td_errors.ravel(), priority_exponent=priority_exponent)
+    # Only these are news, and what a row that was drawn twice gets is the same.
+    drawn = jnp.where(batch.drawn, batch.rows, replay.priorities.capacity)
+    next_value = replay.rows.next_value.at[drawn].set(values, mode="drop")
+    return replay.replace(rows=replay.rows.replace(next_value=next_value))
+
+
 def set_priorities(replay: Replay, rows: jax.Array, td_errors: jax.Array, *, priority_exponent: float) -> Replay:
-    """Set the priorities of rows [B] to (|TD error| + MIN_TD_ERROR)^priority_exponent; dead rows stay dead."""
+    """Set the priorities of rows [B] to (|TD error| + MIN_TD_ERROR)^priority_exponent.
+
+    Dead rows stay dead, and rows out of range are left out.
+    """
     priority = (jnp.abs(td_errors) + MIN_TD_ERROR) ** priority_exponent
     alive = replay.priorities.leaves[rows] > 0
     return replay.replace(priorities=sum_tree.set_leaves(replay.priorities, rows, jnp.where(alive, priority, 0.0)))
@@ -314,9 +378,8 @@ def forget(replay: Replay, lost: jax.Array) -> Replay:
     )
 
 
-def _importance_weights(replay: Replay, slots: jax.Array, exponent: jax.Array | float) -> jax.Array:
-    """Return (1 / (N p))^exponent over its largest in the batch, [B]."""
-    priority = replay.priorities.leaves[slots]
+def _importance_weights(priority: jax.Array, exponent: jax.Array | float) -> jax.Array:
+    """Return (1 / (N p))^exponent over its largest in the batch, [B], for p in proportion to `priority` [B]."""
     # N and the total cancel in the ratio: the largest weight belongs to the smallest priority.
     return (jnp.min(priority) / priority) ** exponent
 

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 
 from pregrasp_jax.robot.base import Robot
-from pregrasp_jax.types import PhysicsObservation, SceneParams
+from pregrasp_jax.types import PhysicsObservation
 
 MAX_SPEED = 100.0
 """Generalized speed (m/s or rad/s) above which a scene counts as diverged."""
@@ -23,7 +23,8 @@ class Engine:
     Attributes:
         name: as in `PhysicsConfig.engine`.
         init: () -> state with empty slots and the robot at the start pose.
-        reset: (state, scene) -> state in which the scene's objects stand still and the robot is at the start pose.
+        reset: (state, scene, mirrored=False) -> state in which the scene's objects stand still and the robot is at the
+            start pose, in the mirror image of its posture if `mirrored` () bool.
         run: (state, ctrl [T, A] rad or m, num_ctrl int32) -> state after the first `num_ctrl` rows, each
             `types.CTRL_DT` long; the control moves linearly from row k to row k + 1. A diverged scene stays diverged.
         observe: (state) -> `PhysicsObservation`.
@@ -36,7 +37,7 @@ class Engine:
 
     name: str
     init: Callable[[], Any]
-    reset: Callable[[Any, SceneParams], Any]
+    reset: Callable[..., Any]
     run: Callable[[Any, jax.Array, jax.Array], Any]
     observe: Callable[[Any], PhysicsObservation]
     coordinates: Callable[[Any], tuple[jax.Array, jax.Array]]

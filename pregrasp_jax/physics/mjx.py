@@ -15,6 +15,7 @@ import flax.struct as struct
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import constraint, forward, scan, smooth, solver
 
@@ -83,9 +84,7 @@ def make_engine(
     """
     model = make_mjx_slot_model(bank, robot, workspace, limits=limits, num_slots=num_slots, num_hulls=num_hulls)
     template = mjx.make_data(model.mjx_model)
-    data = mujoco.MjData(model.mj_model)
-    robot.set_home(model.mj_model, data)
-    home_qpos = jnp.asarray(data.qpos, float)
+    home_qpos = jnp.asarray([_home_qpos(model.mj_model, robot, home) for home in robot.homes], float)
     joint_ids = robot.joint_qpos_ids(model.mj_model)
     parked = jnp.asarray(parking_poses(), float)
     zero = jnp.int32(0)
@@ -104,9 +103,9 @@ def make_engine(
             max_contacts=zero,
         )
 
-    def reset(state: MjxState, scene: SceneParams) -> MjxState:
+    def reset(state: MjxState, scene: SceneParams, mirrored: jax.Array | bool = False) -> MjxState:
         del state
-        qpos = home_qpos.at[model.qpos_ids].set(scene.poses[:num_slots])
+        qpos = home_qpos[jnp.asarray(mirrored, jnp.int32)].at[model.qpos_ids].set(scene.poses[:num_slots])
         return place(scene.object_ids, qpos, jnp.zeros(model.mj_model.nv))
 
     def init() -> MjxState:
@@ -127,6 +126,13 @@ def make_engine(
         return state.qpos, state.qvel
 
     return Engine("mjx", init, reset, run, observe, coordinates, place)
+
+
+def _home_qpos(mj_model: mujoco.MjModel, robot: Robot, home: np.ndarray) -> np.ndarray:
+    """Return qpos [nq] with the robot at rest at joint positions."""
+    data = mujoco.MjData(mj_model)
+    robot.set_home(mj_model, data, home=home)
+    return data.qpos.copy()
 
 
 def run_controls(

@@ -52,7 +52,12 @@ class Simulations:
     """A `Batch` that grows to the number of scenes it is asked for, with the objects loaded in each.
 
     Not for concurrent use by several owners: a lock serialises calls, and evaluation makes its own engine.
+
+    Attributes:
+        max_penetration: m, how deep a contact may be.
     """
+
+    max_penetration = MAX_PENETRATION
 
     def __init__(self, model: SlotModel, robot: Robot, *, threads: int = 0):
         slot_model.silence_warnings()
@@ -61,7 +66,7 @@ class Simulations:
         self._threads = threads
         self._lock = threading.Lock()
         self._joint_ids = robot.joint_qpos_ids(model.mj_model)
-        self._set_home = robot.set_home
+        self._robot = robot
         self._record = ("sensordata",) if model.mj_model.nsensordata else ()
         self._allocate(1)
 
@@ -108,13 +113,8 @@ class Simulations:
             that of an object below the table is), in any physics step; not finite or too fast at the end.
         """
         with self._lock:
-            self.load(object_ids)
-            batch, num_scenes = self._batch, len(state)
-            # The state does not say which objects sleep, so all are woken: the result depends on nothing before.
-            batch.reset(np.arange(num_scenes))
-            batch.state[:num_scenes] = state
-            batch.warning[:num_scenes] = 0
-            fine = _interpolate(ctrl, self.num_substeps)
+            batch, num_scenes = self._begin(state, object_ids), len(state)
+            fine = interpolate(ctrl, self.num_substeps)
             failed, deep = np.zeros((2, num_scenes), bool)
             start = 0
             for stop in np.unique(num_ctrl[num_ctrl > 0]):
@@ -122,18 +122,37 @@ class Simulations:
                 if ids.size == 0:
                     break
                 rows = slice(start * self.num_substeps, stop * self.num_substeps)
-                nearest = np.zeros((len(ids), rows.stop - rows.start, 1))
-                out: dict[Any, np.ndarray] = {"sensordata": nearest}
-                try:
-                    batch.rollout(nearest.shape[1], fine[ids, rows], record=self._record, ids=ids, out=out)
-                except SimulationError as error:
-                    failed[error.ids] = True
-                deep[ids] |= nearest.min(axis=(1, 2)) < -MAX_PENETRATION
+                sensed, errors = self._roll(ids, fine[ids, rows])
+                failed[errors] = True
+                deep[ids] |= sensed[..., 0].min(axis=1) < -self.max_penetration
                 failed |= batch.warning[:num_scenes].any(axis=(1, 2))
                 start = stop
             new_state = batch.state[:num_scenes].copy()
             speed = np.abs(batch.bind("qvel")[:num_scenes]).max(axis=1)
         return new_state, failed | deep | ~(speed < MAX_SPEED) | ~np.isfinite(new_state).all(axis=1)
+
+    def _begin(self, state: np.ndarray, object_ids: np.ndarray) -> Batch:
+        """Put objects and states [E, nstate] into the first E simulations."""
+        self.load(object_ids)
+        scenes = np.arange(len(state))
+        # The state does not say which objects sleep, so all are woken: the result depends on nothing before.
+        self._batch.reset(scenes, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        self._batch.state[scenes] = state
+        self._batch.warning[scenes] = 0
+        return self._batch
+
+    def _roll(self, ids: np.ndarray, ctrl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Step simulations [n] with controls [n, T, A]; return sensors [n, T, S] and the simulations that failed.
+
+        The first sensor is the deepest contact; a model without sensors gives zeros.
+        """
+        sensed = np.zeros((*ctrl.shape[:2], max(self.model.mj_model.nsensordata, 1)))
+        out: dict[Any, np.ndarray] = {"sensordata": sensed}
+        try:
+            self._batch.rollout(ctrl.shape[1], ctrl, record=self._record, ids=ids, out=out)
+        except SimulationError as error:
+            return sensed, error.ids
+        return sensed, ids[:0]
 
     def describe(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return object poses [E, MAX_OBJECTS, 7] and joint positions [E, J] float32 of states [E, nstate]."""
@@ -146,17 +165,18 @@ class Simulations:
         qpos, qvel = (state[..., offset : offset + size] for offset, size in parts)
         return qpos, qvel
 
-    def home_state(self) -> np.ndarray:
-        """Return the state [nstate] with the robot at the start and empty slots parked."""
-        mj_model, data = self.model.mj_model, mujoco.MjData(self.model.mj_model)
-        self._set_home(mj_model, data)
-        state = np.zeros(self.state_size)
-        mujoco.mj_getState(mj_model, data, state, _STATE)
-        self.coordinates(state)[0][self.model.slot_qpos_ids] = slot_model.parking_poses()
-        return state
+    def home_states(self) -> np.ndarray:
+        """Return the states [2, nstate] with the robot in the postures of `Robot.homes` and empty slots parked."""
+        states = np.zeros((2, self.state_size))
+        for state, home in zip(states, self._robot.homes, strict=True):
+            mj_model, data = self.model.mj_model, mujoco.MjData(self.model.mj_model)
+            self._robot.set_home(mj_model, data, home=home)
+            mujoco.mj_getState(mj_model, data, state, _STATE)
+            self.coordinates(state)[0][self.model.slot_qpos_ids] = slot_model.parking_poses()
+        return states
 
 
-def _interpolate(ctrl: np.ndarray, num_substeps: int) -> np.ndarray:
+def interpolate(ctrl: np.ndarray, num_substeps: int) -> np.ndarray:
     """Return [E, T * num_substeps, nu] float64: the control of every physics step, linear between the rows."""
     ctrl = ctrl.astype(np.float64)
     following = np.concatenate([ctrl[:, 1:], ctrl[:, -1:]], axis=1)
@@ -165,11 +185,13 @@ def _interpolate(ctrl: np.ndarray, num_substeps: int) -> np.ndarray:
     return fine.reshape(len(ctrl), -1, ctrl.shape[-1])
 
 
-def _to_bits(state: np.ndarray) -> np.ndarray:
+def to_bits(state: np.ndarray) -> np.ndarray:
+    """Return states [..., nstate] float64 as pairs of uint32 [..., 2 * nstate]."""
     return np.ascontiguousarray(state).view(np.uint32)
 
 
-def _from_bits(bits: np.ndarray) -> np.ndarray:
+def from_bits(bits: np.ndarray) -> np.ndarray:
+    """Return the states of bits; inverse of `to_bits`."""
     return np.ascontiguousarray(bits).view(np.float64)
 
 
@@ -217,7 +239,12 @@ def make_engine(
         model: a slot model of other hulls or options for the same objects.
     """
     model = model or slot_model.make_slot_model(native_spec(robot, workspace), bank)
-    native = _Native(Simulations(model, robot, threads=threads), robot)
+    return engine_of(Simulations(model, robot, threads=threads), robot)
+
+
+def engine_of(simulations: Simulations, robot: Robot) -> Engine:
+    """Return the engine that runs on `simulations`; see `make_engine`."""
+    native = _Native(simulations, robot)
     return Engine(
         name="native",
         init=native.init,
@@ -235,9 +262,9 @@ class _Native:
 
     def __init__(self, simulations: Simulations, robot: Robot):
         self._simulations, self._robot = simulations, robot
-        home = simulations.home_state()
-        self._home_bits = _to_bits(home)
-        self._home_joint_pos = simulations.describe(home[None])[1][0]
+        homes = simulations.home_states()
+        self._home_bits = to_bits(homes)
+        self._home_joint_pos = simulations.describe(homes)[1]
         model = simulations.model.mj_model
         # Where qpos and qvel lie among the numbers of a state.
         self._qpos_ids, self._qvel_ids = simulations.coordinates(np.arange(simulations.state_size))
@@ -247,19 +274,20 @@ class _Native:
         poses = jnp.asarray(slot_model.parking_poses(), jnp.float32)
         return self.reset(None, SceneParams(jnp.full(MAX_OBJECTS, -1, jnp.int32), poses, jnp.int32(0)))
 
-    def reset(self, state: NativeState | None, scene: SceneParams) -> NativeState:
+    def reset(self, state: NativeState | None, scene: SceneParams, mirrored: jax.Array | bool = False) -> NativeState:
         del state
+        posture = jnp.asarray(mirrored, jnp.int32)
         slots = self._qpos_ids[self._simulations.model.slot_qpos_ids]
         return NativeState(
-            bits=self._write(jnp.asarray(self._home_bits), slots, scene.poses),
+            bits=self._write(jnp.asarray(self._home_bits)[posture], slots, scene.poses),
             object_ids=scene.object_ids.astype(jnp.int32),
             object_poses=scene.poses.astype(jnp.float32),
-            joint_pos=jnp.asarray(self._home_joint_pos),
+            joint_pos=jnp.asarray(self._home_joint_pos)[posture],
             diverged=jnp.zeros((), bool),
         )
 
     def place(self, object_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> NativeState:
-        bits = self._write(jnp.asarray(self._home_bits), self._qpos_ids, qpos)
+        bits = self._write(jnp.asarray(self._home_bits)[0], self._qpos_ids, qpos)
         model = self._simulations.model
         return NativeState(
             bits=self._write(bits, self._qvel_ids, qvel),
@@ -282,9 +310,9 @@ class _Native:
         )
         ctrl = np.asarray(ctrl).reshape(-1, *np.shape(ctrl)[-2:])
         num_ctrl = np.where(was_diverged, 0, np.asarray(num_ctrl).reshape(-1))
-        new_state, diverged = self._simulations.run(_from_bits(bits), object_ids, ctrl, num_ctrl)
+        new_state, diverged = self._simulations.run(from_bits(bits), object_ids, ctrl, num_ctrl)
         leaves = (
-            _to_bits(new_state),
+            to_bits(new_state),
             object_ids.astype(np.int32),
             *self._simulations.describe(new_state),
             diverged | was_diverged,
@@ -297,7 +325,7 @@ class _Native:
 
     def coordinates(self, state: NativeState) -> tuple[jax.Array, jax.Array]:
         def read(bits: Any) -> tuple[np.ndarray, ...]:
-            found = self._simulations.coordinates(_from_bits(np.asarray(bits)))
+            found = self._simulations.coordinates(from_bits(np.asarray(bits)))
             return tuple(values.astype(np.float32) for values in found)
 
         shapes = tuple(jax.ShapeDtypeStruct((size,), jnp.float32) for size in self._sizes)

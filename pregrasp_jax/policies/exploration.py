@@ -15,7 +15,9 @@ _MIN_ANGLE_STD = 1e-3
 """rad; an `angle_std` of 0 means the direction nearest to the target, not a division by zero."""
 
 
-def linear_schedule(step: jax.Array | int, *, start: float, end: float, steps: int) -> jax.Array:
+def linear_schedule(
+    step: jax.Array | int, *, start: float, end: float, steps: jax.Array | np.floating | float
+) -> jax.Array:
     """Return the value () float32 that moves linearly from `start` at step 0 to `end` at `steps`, then stays."""
     return jnp.float32(start) + jnp.clip(jnp.float32(step) / steps, 0.0, 1.0) * (end - start)
 
@@ -76,6 +78,32 @@ def softmax_action(key: jax.Array, q: jax.Array, mask: jax.Array, *, temperature
     """
     logits = jnp.where(mask, q / temperature, -jnp.inf)
     return jax.random.categorical(key, logits.ravel()).astype(jnp.int32)
+
+
+def best_apart(q: jax.Array, mask: jax.Array, actions: ActionSpace, *, count: int, spacing: float) -> jax.Array:
+    """Return the best pushes that differ: each ends at least `spacing` away from all better ones of its choice.
+
+    Args:
+        q: [H, W, K].
+        mask: [H, W, K] bool, at least one action.
+        actions: what they mean.
+        count: how many; where no more can be told apart they begin anew with the best.
+        spacing: m.
+
+    Returns:
+        [count] int32, the best first.
+    """
+    cells, choices = jnp.arange(grid.GRID_SIZE), jnp.arange(actions.num_choices)
+
+    def take(left: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+        left = jnp.where(jnp.any(left), left, mask)
+        action = jnp.argmax(jnp.where(left, q, -jnp.inf)).astype(jnp.int32)
+        row, col, choice = actions.unravel(action)
+        squared = (cells[:, None] - row) ** 2 + (cells[None] - col) ** 2
+        near = squared < (spacing / grid.HEIGHTMAP_RESOLUTION) ** 2 - 1e-3
+        return left & ~(near[..., None] & (choices == choice)[None, None]), action
+
+    return jax.lax.scan(take, mask, None, length=count)[1]
 
 
 def random_action(key: jax.Array, mask: jax.Array, actions: ActionSpace) -> jax.Array:

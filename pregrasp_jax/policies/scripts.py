@@ -4,6 +4,7 @@ A policy maps one scene and a key to an action; `jax.vmap` it over scenes.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import flax.struct as struct
 import jax
@@ -16,8 +17,8 @@ from pregrasp_jax.spaces.actions import ActionSpace
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.types import EnvState
 
-Policy = Callable[[EnvState, jax.Array], jax.Array]
-"""(state, key) -> action () int32, unbatched."""
+Policy = Callable[[EnvState, jax.Array], Any]
+"""(state, key) -> action, unbatched: () int32 or what else the primitive takes."""
 
 CLEAR_DISTANCE = 0.13
 """m; `clear` opens its hand when the grasp point is this near to the target, a little less than a push is long."""

@@ -1,10 +1,10 @@
 """Figures of a run: learning curves, why episodes fail, where the time goes."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pregrasp_jax.evaluation.statistics import is_interval, is_number
+from pregrasp_jax.evaluation.statistics import is_interval, is_number, workspace_of
 from pregrasp_jax.report.markup import Markup, element, join
 from pregrasp_jax.report.record import SECONDS, RunRecord
 from pregrasp_jax.report.svg import Point, Series, bar_chart, line_chart
@@ -24,8 +24,18 @@ REASON_WORDS = {
     "no_action": "nowhere left to push",
     "truncated": "pushes used up",
     "grasp_failed": "grasp failed",
+    "target_not_alone": "target held, but not alone",
+    "obstacle_grasped": "obstacle grasped",
 }
 """Reasons for people; they are explained at `judge` and `types.REASONS`."""
+
+OBSTRUCTION_WORDS = {
+    "no_ik": "no solution",
+    "joint_limit": "joint limit",
+    "too_long": "too long",
+    "end_error": "end not reached",
+}
+"""Obstructions for people, of `types.OBSTRUCTIONS`; others are words themselves."""
 
 _STEPS = "environment steps (pushes)"
 
@@ -43,13 +53,19 @@ def learning_figures(run: RunRecord) -> list[Markup]:
         "epsilon": run.curve("train/epsilon"),
         "random pushes, measured": run.curve("train/explored"),
     }
+    starts = {"learning": run.curve("train/start_loss"), "validation": run.curve("eval/start_loss")}
+    apertures = {"learning": run.curve("train/aperture_loss"), "validation": run.curve("eval/aperture_loss")}
+    strokes = "strokes, then updates"
     figures = [
-        _figure("Success against pushes", _success(run), x_label=_STEPS, **percent),
-        _figure("Success against time", _success(run, **time), x_label=f"training time ({unit})", **percent),
-        _figure("Loss", _lines({"loss per update": run.curve("train/loss")}), x_label=_STEPS, y_label="Huber loss"),
-        _figure("Q-values", _lines(values), x_label=_STEPS, y_label="Q, discounted reward"),
-        _figure("Exploration", _lines(exploring), x_label=_STEPS, y_label="share of pushes", y_limits=(0.0, 1.0)),
-        _figure("Motions", _motions(run), x_label=_STEPS, y_label="pushes per episode"),
+        figure("Stable grasps", _lines({"kept": run.curve("collect/stable")}), x_label=strokes, y_label="grasps"),
+        figure("Loss of starts", _lines(starts), x_label=strokes, y_label="cross-entropy"),
+        figure("Loss of apertures", _lines(apertures), x_label=strokes, y_label="Huber loss"),
+        figure("Success against pushes", _success(run), x_label=_STEPS, **percent),
+        figure("Success against time", _success(run, **time), x_label=f"training time ({unit})", **percent),
+        figure("Loss", _lines({"loss per update": run.curve("train/loss")}), x_label=_STEPS, y_label="Huber loss"),
+        figure("Q-values", _lines(values), x_label=_STEPS, y_label="Q, discounted reward"),
+        figure("Exploration", _lines(exploring), x_label=_STEPS, y_label="share of pushes", y_limits=(0.0, 1.0)),
+        figure("Motions", _motions(run), x_label=_STEPS, y_label="pushes per episode"),
     ]
     return [figure for figure in figures if figure]
 
@@ -66,14 +82,17 @@ def failure_figures(run: RunRecord, documents: Sequence[dict[str, Any]]) -> list
     if failures and is_number(rate) and rate < 1:
         # The file has no number of scenes, but every scene that is no success is a failure.
         scenes = round(sum(failures.values()) / (1 - rate))
-        figures.append(_reasons(f"Validation, best policy, {scenes} scenes", failures, scenes))
+        title = f"Validation, best policy, {scenes} scenes"
+        figures.append(_reasons(title, failures, scenes, _obstructions(run.best)))
     for document in documents:
-        title = f"Test, {document['object_set']} objects, {document['camera']} camera, {document['episodes']} scenes"
-        figures.append(_reasons(title, _counts(document["failures"]), document["episodes"]))
-    ended = _recent_ends(run)
+        where = f"{document['object_set']} objects, {workspace_of(document)}, {document['camera']} camera"
+        title, counts = f"Test, {where}, {document['episodes']} scenes", _counts(document["failures"])
+        figures.append(_reasons(title, counts, document["episodes"], _obstructions(document)))
+    ended, stopped = _recent_ends(run)
     if total := sum(ended.values()):
         del ended[SUCCESS]
-        figures.append(_reasons(f"Training with exploration, last {total} episodes", ended, total))
+        title = f"Training with exploration, last {total} episodes"
+        figures.append(_reasons(title, ended, total, {"unreachable": stopped}))
     return figures
 
 
@@ -85,10 +104,10 @@ def time_figures(run: RunRecord) -> list[Markup]:
     if total := sum(known.values()):
         items = [(phase, 100 * s / total, f"{_percent(s / total)}, {duration(s)}") for phase, s in known.items()]
         title = f"Time by phase, {duration(total)} in all"
-        figures.append(_boxed(title, bar_chart(items, title=title, x_label="share of the time (%)", x_limit=100.0)))
+        figures.append(boxed(title, bar_chart(items, title=title, x_label="share of the time (%)", x_limit=100.0)))
     speed = _lines({"pushes": run.curve("time/env_steps_per_second")})
     figures.append(
-        _figure("Speed, learning and evaluation included", speed, x_label=_STEPS, y_label="pushes per second")
+        figure("Speed, learning and evaluation included", speed, x_label=_STEPS, y_label="pushes per second")
     )
     return [figure for figure in figures if figure]
 
@@ -134,25 +153,31 @@ def _lines(curves: dict[str, list[Point]]) -> list[Series]:
     return [Series(label=label, points=points) for label, points in curves.items()]
 
 
-def _figure(title: str, series: Sequence[Series], **axes: Any) -> Markup:
+def figure(title: str, series: Sequence[Series], **axes: Any) -> Markup:
     """Return a chart with its legend, nothing if there is no point to draw."""
     if not any(line.points for line in series):
         return Markup("")
     keys = [
-        element("span", element("i", class_=f"key s{index}", aria_hidden="true"), line.label)
+        element("span", element("i", class_=f"key {line.color(index)}", aria_hidden="true"), line.label)
         for index, line in enumerate(series)
-        if line.points
+        if line.points and line.label
     ]
-    return _boxed(title, line_chart(series, title=title, **axes), element("p", *keys, class_="legend"))
+    return boxed(title, line_chart(series, title=title, **axes), element("p", *keys, class_="legend"))
 
 
-def _reasons(title: str, failures: Counter[str], total: int) -> Markup:
+def _reasons(title: str, failures: Counter[str], total: int, obstructions: Mapping[str, Counter[str]]) -> Markup:
+    """Return bars of reasons, with what was in the way where that is known."""
     found = [(reason, count) for reason, count in failures.most_common() if count]
     if not found:
-        return _boxed(title, element("p", "No episode failed."))
-    items = [(_words(reason), 100 * count / total, f"{_percent(count / total)} ({count})") for reason, count in found]
+        return boxed(title, element("p", "No episode failed."))
+    items = []
+    for reason, count in found:
+        known = obstructions.get(reason, Counter()).most_common()
+        details = ", ".join(f"{OBSTRUCTION_WORDS.get(name, name)} {number}" for name, number in known if number)
+        text = f"{_percent(count / total)} ({count}{': ' if details else ''}{details})"
+        items.append((_words(reason), 100 * count / total, text))
     limit = max(10.0, 10 * -(-max(value for _, value, _ in items) // 10))
-    return _boxed(title, bar_chart(items, title=title, x_label="share of the episodes (%)", x_limit=limit))
+    return boxed(title, bar_chart(items, title=title, x_label="share of the episodes (%)", x_limit=limit))
 
 
 def _words(reason: str) -> str:
@@ -163,7 +188,8 @@ def _percent(share: float) -> str:
     return f"{100 * share:.{0 if share == 0 or share >= 0.01 else 1}f} %"
 
 
-def _boxed(title: str, *content: Markup) -> Markup:
+def boxed(title: str, *content: Markup) -> Markup:
+    """Return content in a box with a title."""
     return element("figure", element("figcaption", title), join(content), class_="chart")
 
 
@@ -173,11 +199,22 @@ def _counts(failures: Any) -> Counter[str]:
     return Counter({reason: int(count) for reason, count in pairs if is_number(count)})
 
 
-def _recent_ends(run: RunRecord) -> Counter[str]:
-    """Return how the last training episodes ended, of as many rows as hold `RECENT_EPISODES`."""
+def _obstructions(document: Mapping[str, Any]) -> dict[str, Counter[str]]:
+    """Return what was in the way, by reason, of an evaluation; older ones do not know."""
+    found = document.get("obstructions")
+    return {reason: _counts(counts) for reason, counts in found.items()} if isinstance(found, dict) else {}
+
+
+def _recent_ends(run: RunRecord) -> tuple[Counter[str], Counter[str]]:
+    """Return how the last training episodes ended, and what was in the way of those that were unreachable.
+
+    Rows are counted back from the last until they hold `RECENT_EPISODES`.
+    """
     ended: Counter[str] = Counter()
+    stopped: Counter[str] = Counter()
     for row in reversed(run.metrics):
         if sum(ended.values()) >= RECENT_EPISODES:
             break
-        ended += _counts({key.removeprefix("reasons/"): row[key] for key in row if key.startswith("reasons/")})
-    return ended
+        for counts, group in ((ended, "reasons/"), (stopped, "unreachable/")):
+            counts += _counts({key.removeprefix(group): row[key] for key in row if key.startswith(group)})
+    return ended, stopped

@@ -78,14 +78,14 @@ def build_page(
 ) -> str:
     """Return the page; see `write_report`. Without `episodes` it says how to get them."""
     sections = [
-        _section("Results", *_results(run, documents), *_outdated(outdated)),
-        _section("Learning curves", *_learning(run)),
-        episodes or _section("Episodes", *_how_to_film(run)),
-        _section("Why episodes fail", *_figures(charts.failure_figures(run, results.of_run(run, documents)))),
-        _section("Where the time went", *_figures(charts.time_figures(run))),
-        _section("Configuration and versions", *_settings(run)),
+        section("Results", *_results(run, documents), *_outdated(outdated)),
+        section("Learning curves", *_learning(run)),
+        episodes or section("Episodes", *_how_to_film(run)),
+        section("Why episodes fail", *_figures(charts.failure_figures(run, results.of_run(run, documents)))),
+        section("Where the time went", *_figures(charts.time_figures(run))),
+        section("Configuration and versions", *_settings(run)),
     ]
-    return _page(f"{run.name}: report of a run", _header(run), sections)
+    return make_page(f"{run.name}: report of a run", _header(run), sections)
 
 
 def write_films(path: Path, films: Sequence[Film], *, title: str, text: str, note: str) -> None:
@@ -99,10 +99,11 @@ def write_films(path: Path, films: Sequence[Film], *, title: str, text: str, not
         note: which episodes these are.
     """
     header = [element("h1", title), element("p", text, class_="soft")]
-    io.write_bytes(path, _page(title, header, [_episodes(films, note)]).encode())
+    io.write_bytes(path, make_page(title, header, [_episodes(films, note)]).encode())
 
 
-def _page(title: str, header: Iterable[Markup], sections: Iterable[str]) -> str:
+def make_page(title: str, header: Iterable[Markup], sections: Iterable[str]) -> str:
+    """Return a page that needs nothing from anywhere else."""
     style = importlib.resources.files("pregrasp_jax.report").joinpath("style.css").read_text()
     head = element(
         "head",
@@ -117,7 +118,8 @@ def _page(title: str, header: Iterable[Markup], sections: Iterable[str]) -> str:
     return "<!DOCTYPE html>\n" + element("html", head, body, lang="en") + "\n"
 
 
-def _section(title: str, *content: Markup, policy: str | None = None) -> Markup:
+def section(title: str, *content: Markup, policy: str | None = None) -> Markup:
+    """Return a section of a page; `policy` is the checksum of the one that it shows."""
     return element("section", element("h2", title), "\n", join(content, "\n"), data_policy=policy)
 
 
@@ -203,7 +205,7 @@ def _episodes(films: Sequence[Film], note: str, policy: str | None = None) -> Ma
     ]
     legend = ["height 0 ", ramps[0], " 0.30 m; Q-values lowest ", ramps[1], " highest (numbers under each map)"]
     texts = [element("p", _FILM_KEY, class_="soft"), element("p", *legend, class_="soft"), element("p", note)]
-    return _section("Episodes", *texts, *film_strips(films), policy=policy)
+    return section("Episodes", *texts, *film_strips(films), policy=policy)
 
 
 def _settings(run: RunRecord) -> Iterator[Markup]:

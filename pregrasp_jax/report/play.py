@@ -1,6 +1,7 @@
 """Pictures of policies at work: one decision, whole episodes, and the scenes of a bank."""
 
 import collections
+import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator
@@ -16,11 +17,15 @@ from pregrasp_jax import drawing
 from pregrasp_jax.evaluation.player import Player
 from pregrasp_jax.evaluation.runner import MIN_BATCH, Decision, Evaluator
 from pregrasp_jax.heightmap import HullInstances, scene_hulls
+from pregrasp_jax.spaces.workspace import Box, Workspace
 from pregrasp_jax.task.env import Env
-from pregrasp_jax.types import EnvState
+from pregrasp_jax.types import EnvState, HandPose
 
 SECONDS_PER_FRAME = 1.5
 """s; a panel holds five pictures to look at."""
+
+_CUT_HEIGHT = 0.01
+"""m, what is left of walls that would hide the scene."""
 
 _COLUMNS, _TILE = 4, (240, 320)
 
@@ -95,7 +100,7 @@ def draw_tiles(player: Player, decision: Decision) -> Tiles:
         actions=env.primitive.actions,
         mask=np.asarray(env.action_mask(state.hand)),
         q_values=None if player.q_values is None else np.asarray(player.q_values(state)),
-        action=decision.action,
+        taken=None if decision.action is None else taken_action(env, state.hand, decision.action),
     )
 
 
@@ -105,19 +110,38 @@ def describe_decision(env: Env, decision: Decision) -> tuple[str, str, str]:
     scene, target = f"scene {int(state.scene_index)}", f"target {_target_name(env, state)}"
     if decision.action is None:
         return scene, target, f"{decision.ending} after {int(state.num_pushes)} pushes"
-    return scene, target, f"push {int(state.num_pushes) + 1}: {describe_action(env, decision.action)}"
+    return scene, target, f"push {int(state.num_pushes) + 1}: {describe_action(env, state.hand, decision.action)}"
 
 
-def describe_action(env: Env, action: int) -> str:
+def describe_action(env: Env, hand: HandPose, action: Any) -> str:
     """Return how the hand is held and where it is sent."""
-    actions = env.primitive.actions
-    (x, y), choice = actions.decode(np.int32(action))
-    return f"{actions.choices[int(choice)].name} to x {x:.2f} m, y {y:.2f} m"
+    taken, aperture = taken_action(env, hand, action), float(env.primitive.decode(hand, action).end.aperture)
+    actions, (x, y) = env.primitive.actions, taken.end
+    free = f" at {aperture:.2f} {actions.free[0].unit}" if actions.free else ""
+    return f"{actions.choices[taken.choice].name}{free} to x {x:.2f} m, y {y:.2f} m"
+
+
+def taken_action(env: Env, hand: HandPose, action: Any) -> drawing.Taken:
+    """Return what is drawn of an action in its normal form; `hand` is where it was before."""
+    stroke = env.primitive.decode(hand, action)
+    start, end = (tuple(np.asarray(pose.xy, float).tolist()) for pose in (stroke.start, stroke.end))
+    return drawing.Taken(int(env.primitive.choice(action)), start, end)
 
 
 def env_hulls(env: Env, state: EnvState) -> HullInstances:
-    """Return what stands on the table of a scene, robot and walls included."""
-    return scene_hulls(env.bank, env.robot, state.scene, state.physics_obs, env.workspace)
+    """Return what stands on the table of a scene, robot and walls included; see `_cut_away`."""
+    return scene_hulls(env.bank, env.robot, state.scene, state.physics_obs, _cut_away(env.workspace))
+
+
+def _cut_away(workspace: Workspace) -> Workspace:
+    """Return a place whose walls on the viewer's side (y < 0) are low, so that they hide nothing in pictures."""
+
+    def lowered(wall: Box) -> Box:
+        low = min(wall.half_size[2], _CUT_HEIGHT / 2)
+        return dataclasses.replace(wall, center=(*wall.center[:2], low), half_size=(*wall.half_size[:2], low))
+
+    walls = tuple(lowered(wall) if wall.corners()[:, 1].max() < 0 else wall for wall in workspace.walls)
+    return dataclasses.replace(workspace, walls=walls)
 
 
 def _target_name(env: Env, state: EnvState) -> str:

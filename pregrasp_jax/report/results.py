@@ -1,19 +1,25 @@
 """The result table: a run beside the scripts, with intervals, and paired with it where scenes are the same."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.evaluation import load_evaluation
-from pregrasp_jax.evaluation.statistics import compare
+from pregrasp_jax.evaluation.statistics import compare, policy_name, workspace_of
 from pregrasp_jax.report.markup import Markup, element
 from pregrasp_jax.report.record import RunRecord
 from pregrasp_jax.report.svg import interval_mark
 
-BASELINES = ("random", "straight", "clear", "lookahead")
-"""Scripts that a run is compared with."""
+SCRIPTS = {
+    "q_learning": ("random", "straight", "clear", "lookahead"),
+    "imitation": ("strokes", "target-strokes"),
+}
+"""Scripts that a run is compared with, by its `train.method`."""
+
+BASELINES = tuple(name for names in SCRIPTS.values() for name in names)
+"""All of them."""
 
 EVALUATIONS = "evaluations"
 """Subfolder of a run in which evaluation files are looked for."""
@@ -24,6 +30,7 @@ _EPISODES = 100
 _HEADER = (
     "policy",
     "objects",
+    "place",
     "camera",
     "scenes",
     "success",
@@ -74,15 +81,17 @@ def missing(run: RunRecord, documents: Sequence[dict[str, Any]]) -> list[tuple[s
     """Return what the table lacks, as (what, the command that makes it)."""
     sets = {document["object_set"] for document in documents} or {run.setting("assets", "object_set", "seen")}
     episodes = max((document["episodes"] for document in documents), default=_EPISODES)
+    here = run.setting("task", "workspace", TaskConfig().workspace)
     lacking = []
     for object_set in sorted(sets):
-        present = [document for document in documents if document["object_set"] == object_set]
+        there = [document for document in documents if document["object_set"] == object_set]
+        present = [document for document in there if workspace_of(document) == here]
         names = {document["policy"] for document in present}
-        if not of_run(run, present):
+        if not any(not document.get("planning") for document in of_run(run, present)):
             lacking.append((f"this run on {object_set} objects", _command(run, str(run.path), object_set, episodes)))
         lacking += [
             (f"{name} on {object_set} objects", _command(run, name, object_set, episodes))
-            for name in BASELINES
+            for name in SCRIPTS[run.setting("train", "method", "q_learning")]
             if name not in names
         ]
     return lacking
@@ -100,24 +109,41 @@ def _command(run: RunRecord, policy: str, object_set: str, episodes: int) -> str
     if object_dir := run.setting("assets", "object_dir", None):
         arguments += ["--object-dir", str(object_dir)]
     radius = run.setting("task", "r_out", Config().task.r_out)
-    if policy in BASELINES and radius != TaskConfig().r_out:
-        arguments += ["--r-out", str(radius)]
+    if policy in BASELINES:
+        arguments += ["--r-out", str(radius)] if radius != TaskConfig().r_out else []
+        arguments += list(_place(run))
+    if policy in SCRIPTS["imitation"]:
+        for key in ("robot", "primitive"):
+            arguments += [f"--task.{key}", str(run.setting("task", key, getattr(TaskConfig(), key)))]
     return shlex.join(["pregrasp-jax", "evaluate", *arguments, "--json", str(run.path / EVALUATIONS / f"{name}.json")])
+
+
+def _place(run: RunRecord) -> Iterator[str]:
+    """Yield the options that bring a script to the place of a run."""
+    workspace = run.setting("task", "workspace", TaskConfig().workspace)
+    if workspace != TaskConfig().workspace:
+        yield from ("--workspace", workspace)
+    place = run.setting("task", "place", {})
+    for name, value in place.items() if isinstance(place, dict) else ():
+        if value is not None:
+            yield from (f"--task.place.{name.replace('_', '-')}", str(value))
 
 
 def _row(run: RunRecord, document: dict[str, Any], of_this_run: Sequence[dict[str, Any]]) -> Markup:
     low, high = document["success_ci95"]
     own = is_of_run(run, document)
-    name = element("strong", f"this run ({document['policy']})") if own else document["policy"]
+    name = policy_name(document)
+    name = element("strong", name.replace(document["policy"], f"this run ({document['policy']})")) if own else name
     cells = [
         document["object_set"],
+        workspace_of(document),
         document["camera"],
         str(document["episodes"]),
         percent(document["success_rate"]),
         f"{percent(low)} to {percent(high)}",
         interval_mark(document["success_rate"], low, high),
         _motions(document),
-        "" if own else _paired(of_this_run, document),
+        "" if own and not document.get("planning") else _paired(of_this_run, document),
     ]
     return element(
         "tr", element("th", name, scope="row"), *(element("td", cell) for cell in cells), class_="own" if own else None
@@ -139,11 +165,14 @@ def _paired(of_this_run: Sequence[dict[str, Any]], other: dict[str, Any]) -> str
         low, high = found.difference_ci95
         text = f"{100 * found.difference:+.0f} points ({100 * low:+.0f} to {100 * high:+.0f}), p = {found.p_value:.2g}"
         return text.replace("-", "\N{MINUS SIGN}")
-    return "not on the same scenes" if of_this_run else ""
+    if not of_this_run:
+        return ""
+    here = workspace_of(other) in map(workspace_of, of_this_run)
+    return "not on the same scenes" if here else "in another place"
 
 
-def _rank(run: RunRecord, document: dict[str, Any]) -> tuple[int, str]:
+def _rank(run: RunRecord, document: dict[str, Any]) -> tuple[int, bool, str]:
     if is_of_run(run, document):
-        return 0, document["camera"]
+        return 0, bool(document.get("planning")), document["camera"]
     policy = document["policy"]
-    return (1 + BASELINES.index(policy), policy) if policy in BASELINES else (1 + len(BASELINES), policy)
+    return (1 + BASELINES.index(policy) if policy in BASELINES else 1 + len(BASELINES)), False, policy

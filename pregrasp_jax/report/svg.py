@@ -3,6 +3,7 @@
 Charts are drawn in user units of a 440 wide box, so that text stays legible when the box is as wide as a phone.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,9 @@ _BAR, _BAR_LABELS, _BAR_VALUES = 27, 186, 94
 
 _MOST_POINTS = 400
 """Points of a curve; more are averaged in groups, about one per pixel."""
+
+COLORS = 6
+"""Colours of curves; a seventh curve has that of the first."""
 
 Point = tuple[float, float]
 
@@ -41,16 +45,24 @@ class Series:
     """One curve.
 
     Attributes:
-        label: what it is called in the legend.
+        label: what it is called in the legend; empty leaves it out there.
         points: (x, y), x ascending.
         intervals: (low, high) per point, drawn as error bars; or empty.
         markers: draw the points too, each with its values as a tooltip.
+        band: whether `intervals` are drawn as an area.
+        faint: whether it is drawn as one of a crowd.
     """
 
     label: str
     points: Sequence[Point]
     intervals: Sequence[Point] = ()
     markers: bool = False
+    band: bool = False
+    faint: bool = False
+
+    def color(self, index: int) -> str:
+        """Return the class of the colour of the curve that is drawn as number `index`."""
+        return "faint" if self.faint else f"s{index % COLORS}"
 
 
 def ticks(low: float, high: float, *, most: int = 6) -> list[float]:
@@ -176,9 +188,13 @@ def _axes(x: Scale, y: Scale, x_label: str, y_label: str) -> Markup:
 
 
 def _curve(line: Series, index: int, x: Scale, y: Scale) -> Markup:
-    color = f"s{index}"
+    color = line.color(index)
     if not line.points:
         return Markup("")
+    if line.band:
+        return join(
+            [_band(line, color, x, y), _curve(dataclasses.replace(line, band=False, intervals=()), index, x, y)]
+        )
     points = line.points if line.markers else thin(line.points)
     bars = [
         _line(x(a), y(low), x(a), y(high), f"error {color}")
@@ -191,6 +207,14 @@ def _curve(line: Series, index: int, x: Scale, y: Scale) -> Markup:
         for tooltip, (a, b) in zip(tooltips, marked, strict=True)
     ]
     return join([*bars, element("path", d=path_of(points, x, y), class_=f"curve {color}"), *dots])
+
+
+def _band(line: Series, color: str, x: Scale, y: Scale) -> Markup:
+    """Draw the area between the ends of the intervals."""
+    xs = [a for a, _ in line.points]
+    upper = [(a, high) for a, (_, high) in zip(xs, line.intervals, strict=True)]
+    lower = [(a, low) for a, (low, _) in zip(xs, line.intervals, strict=True)]
+    return element("path", d=path_of([*upper, *reversed(lower)], x, y) + " Z", class_=f"band {color}")
 
 
 def _bar(item: tuple[str, float, str], top: float, x: Scale) -> Markup:

@@ -12,23 +12,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from pregrasp_jax.robot.links import Links
+from pregrasp_jax.robot.chain import Links
+from pregrasp_jax.robot.following import Body
+from pregrasp_jax.robot.region import ClosingRegion
 from pregrasp_jax.spaces.workspace import Workspace
 from pregrasp_jax.types import OBSTRUCTIONS, HandPose, HullBank
-
-
-class ClosingRegion(NamedTuple):
-    """What the closing fingers sweep, in the hand frame (x forward, y to the side), symmetric about y = 0.
-
-    Attributes:
-        x: [P] m, increasing stations along the hand; the first is the palm.
-        half_width: [P] m, half of the region's width there, linear in between.
-        exists: () bool; there is no region unless the fingers are open.
-    """
-
-    x: jax.Array | np.ndarray
-    half_width: jax.Array | np.ndarray
-    exists: jax.Array | np.ndarray | bool
 
 
 class Eligibility(NamedTuple):
@@ -55,7 +43,7 @@ class Robot:
         home: [J] joint positions at the start, host array, rad or m.
         links: the bodies that move, and their hulls.
         attach: host; (spec) -> None adds bodies, actuators and constraints to a scene.
-        set_home: host; (mj_model, mj_data) -> None puts the robot at rest at `home`.
+        set_home: host; (mj_model, mj_data, *, home=`home`) -> None puts the robot at rest at joint positions.
         hand_pose: (joint_pos [J]) -> [7] pose of the grasp point in the world, x forward, z up.
         follow: (joint_pos [J], poses [T, 7], apertures [T], workspace) -> controls [T, A] and code [T] int32, for every
             row an index into `OBSTRUCTIONS`: what keeps the hand from that pose. Rows are `types.CTRL_DT` apart.
@@ -63,6 +51,12 @@ class Robot:
         closing_region: (aperture () rad) -> `ClosingRegion`; None for a hand without one.
         eligibility: host; (hull bank) -> `Eligibility`.
         grasp_aperture: rad, commanded to close with constant force.
+        front: (aperture () rad, y [...] m) -> [...] m, how far forward the open hand reaches on lines at y beside its
+            heading, -inf where it does not; None where nobody asks.
+        fingertips: names of the links that end the fingers; what nothing but them touches is pinched, not held.
+        body: of an arm with closed-form kinematics, so that a deployed policy can do without MuJoCo; None if there is
+            none.
+        mirrored_home: [J] the mirror image of `home` in the plane y = 0, host array; None if the robot has none.
     """
 
     name: str
@@ -72,13 +66,22 @@ class Robot:
     home: np.ndarray
     links: Links
     attach: Callable[[mujoco.MjSpec], None]
-    set_home: Callable[[mujoco.MjModel, mujoco.MjData], None]
+    set_home: Callable[..., None]
     hand_pose: Callable[[jax.Array], jax.Array]
     follow: Callable[[jax.Array, jax.Array, jax.Array, Workspace], tuple[jax.Array, jax.Array]]
     clearance: Callable[[jax.Array, Workspace], jax.Array]
     closing_region: Callable[[jax.Array], ClosingRegion] | None
     eligibility: Callable[[HullBank], Eligibility]
     grasp_aperture: float
+    front: Callable[[jax.Array, jax.Array], jax.Array] | None = None
+    fingertips: tuple[str, ...] = ()
+    body: Body | None = None
+    mirrored_home: np.ndarray | None = None
+
+    @property
+    def homes(self) -> np.ndarray:
+        """The posture at the start and its mirror image, [2, J]; twice the same where there is none."""
+        return np.stack([self.home, self.home if self.mirrored_home is None else self.mirrored_home])
 
     def joint_qpos_ids(self, mj_model: mujoco.MjModel) -> np.ndarray:
         """Return the addresses [J] in qpos of the joints."""

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from pregrasp_jax import io
+from pregrasp_jax.robot.kinematics import Arm
 from pregrasp_jax.robot.links import pose_to_matrix
 
 ARM_JOINTS = tuple(f"arm_{i}" for i in range(6))
@@ -19,6 +20,9 @@ JOINTS = (*ARM_JOINTS, *FINGER_JOINTS)
 
 ACTUATORS = (*ARM_JOINTS, "hand_fingers")
 """The seven controls, rad: six arm joints and the drive of both fingers."""
+
+MAX_JOINT_SPEED = 3.14
+"""rad/s, 180 degrees per second for every joint (UR5e data sheet)."""
 
 BASE_BODY = "base"
 HAND_BODY = PALM_GEOM = "hand_palm"
@@ -52,6 +56,21 @@ def dh_parameters() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     positions = np.stack([*mj_model.body_pos[bodies[1:]], flange.pos])
     quats = np.stack([*mj_model.body_quat[bodies[1:]], flange.quat])
     return positions[:, 0], positions[:, 2], 2 * np.arctan2(quats[:, 1], quats[:, 0])
+
+
+@functools.cache
+def arm() -> Arm:
+    """Return the arm with its hand."""
+    a, d, alpha = dh_parameters()
+    return Arm(
+        a=a,
+        d=d,
+        alpha=alpha,
+        world_from_base=world_from_base(),
+        flange_from_hand=flange_from_grasp_point(),
+        limits=np.stack([joint_range(name) for name in ARM_JOINTS]),
+        max_speed=MAX_JOINT_SPEED,
+    )
 
 
 def world_from_base() -> np.ndarray:

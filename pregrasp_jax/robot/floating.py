@@ -5,7 +5,7 @@ kinematics: its pose is its joint positions.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,8 @@ import numpy as np
 from pregrasp_jax.geometry import quat_from_yaw
 from pregrasp_jax.robot import clearance
 from pregrasp_jax.robot.base import ClosingRegion, Eligibility, Robot, first_obstruction
-from pregrasp_jax.robot.links import Links, make_links
+from pregrasp_jax.robot.chain import Links
+from pregrasp_jax.robot.links import make_links
 from pregrasp_jax.spaces.workspace import Workspace
 from pregrasp_jax.types import CTRL_DT, HandPose, HullBank
 
@@ -45,8 +46,10 @@ def make_floating_hand(
     start: HandPose,
     closing_region: Callable[[jax.Array], ClosingRegion] | None,
     eligibility: Callable[[HullBank], Eligibility],
-    fingers: Sequence[str] = (),
+    fingers: Sequence[str] | Mapping[str, float] = (),
     grasp_aperture: float = 0.0,
+    front: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
+    fingertips: Sequence[str] = (),
 ) -> Robot:
     """Return a hand that goes wherever it is sent.
 
@@ -57,16 +60,26 @@ def make_floating_hand(
         start: where the hand is at the start of an episode, in host arrays (see `hand_pose_of`).
         closing_region: as in `Robot`.
         eligibility: as in `Robot`.
-        fingers: joints of the MJCF that stand at the aperture; each needs a position actuator of the same name. Others
-            must follow one of them by an equality.
+        fingers: joints of the MJCF that stand at the aperture, or at the share of it that a mapping gives; each needs a
+            position actuator of the same name. Others must follow one of them by an equality.
         grasp_aperture: as in `Robot`.
+        front: as in `Robot`.
+        fingertips: bodies of the MJCF, see `Robot`.
 
     Raises:
         ValueError: the MJCF is not such a hand.
     """
     joints = (*JOINTS, *(PREFIX + finger for finger in fingers))
-    links = make_links(_carried(name, mjcf).compile(), joints)
-    home = np.array([*start.xy, start.z, start.yaw, *[start.aperture] * len(fingers)], np.float32)
+    mj_model = _carried(name, mjcf).compile()
+    links = make_links(mj_model, joints)
+    drives = tuple(mj_model.actuator(i).name for i in range(mj_model.nu))
+    if drives != joints:
+        had, wanted = (", ".join(x.removeprefix(PREFIX) for x in names[len(JOINTS) :]) for names in (drives, joints))
+        raise ValueError(
+            f"the actuators of hand {name} are {had or 'none'}; allowed are {wanted or 'none'}, in this order"
+        )
+    shares = np.array(list(fingers.values()) if isinstance(fingers, Mapping) else [1.0] * len(fingers), np.float32)
+    home = np.array([*start.xy, start.z, start.yaw, *(start.aperture * shares)], np.float32)
 
     def attach(spec: mujoco.MjSpec) -> None:
         spec.worldbody.add_frame().attach_body(_carried(name, mjcf).body(JOINTS[0]), "", "")
@@ -77,16 +90,19 @@ def make_floating_hand(
         actuators=joints,
         start=start,
         home=home,
+        mirrored_home=home if start.xy[1] == 0 and start.yaw == 0 else None,
         links=links,
         attach=attach,
         set_home=functools.partial(_set_home, links=links, joints=joints, home=home),
         hand_pose=lambda joint_pos: jnp.append(joint_pos[:3], quat_from_yaw(joint_pos[3])),
-        follow=functools.partial(_follow, links, len(fingers)),
+        follow=functools.partial(_follow, links, shares),
         # The fingers may touch the table, so that only walls are kept clear of.
         clearance=lambda joint_pos, place: clearance.distance_to_walls(links, links.geoms, joint_pos, place),
         closing_region=closing_region,
         eligibility=eligibility,
         grasp_aperture=grasp_aperture,
+        front=front,
+        fingertips=tuple(PREFIX + tip for tip in fingertips),
     )
 
 
@@ -121,23 +137,21 @@ def _carried(name: str, mjcf: str) -> mujoco.MjSpec:
 
 
 def _follow(
-    links: Links, num_fingers: int, joint_pos: jax.Array, poses: jax.Array, apertures: jax.Array, workspace: Workspace
+    links: Links, shares: np.ndarray, joint_pos: jax.Array, poses: jax.Array, apertures: jax.Array, workspace: Workspace
 ) -> tuple[jax.Array, jax.Array]:
     """Follow poses of the grasp point; see `Robot.follow`. Commands have velocity feed-forward."""
     yaw = jnp.unwrap(2 * jnp.arctan2(poses[:, 6], poses[:, 3]))
     turns = jnp.round((joint_pos[3] - yaw[0]) / (2 * jnp.pi))
     carrier = jnp.concatenate([poses[:, :3], (yaw + 2 * jnp.pi * turns)[:, None]], axis=1)
-    fingers = jnp.broadcast_to(apertures[:, None], (len(poses), num_fingers))
+    fingers = apertures[:, None] * shares[None]
     path = jnp.concatenate([carrier, fingers], axis=1)
     low, high = jnp.array(REACH).T
     height = jax.vmap(lambda q: clearance.height_above_table(links, links.geoms, q))(path)
     holds = {
         "joint_limit": ~jnp.all((carrier[:, :3] >= low[None]) & (carrier[:, :3] <= high[None]), axis=-1),
         "table": ~(height >= 0),
+        "wall": clearance.near_walls(links, links.geoms, path, poses, apertures, workspace),
     }
-    if workspace.walls:
-        beside = jax.vmap(lambda q: clearance.distance_to_walls(links, links.geoms, q, workspace))(path)
-        holds["wall"] = ~(beside >= clearance.CLEARANCE_MARGIN)
     lead = jnp.array([kv / kp for kp, kv in (*[_SLIDE_GAINS] * 3, _HINGE_GAINS)])
     velocity = jnp.asarray(jnp.gradient(carrier, CTRL_DT, axis=0))
     return jnp.concatenate([carrier + lead[None] * velocity, fingers], axis=1), first_obstruction(holds)

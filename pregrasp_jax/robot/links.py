@@ -1,99 +1,23 @@
-"""Where every part of a robot is, and its shape as convex hulls in link frames; both derived from its MJCF.
+"""The links of a robot and their shapes as convex hulls, derived from its MJCF.
 
 A link is a body of the MJCF. `make_links` tabulates them once, when a robot is made.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from pregrasp_jax.assets.hulls import make_hulls
-from pregrasp_jax.geometry import matrix_product, matrix_to_pose
-from pregrasp_jax.types import FULL_TOPOLOGY, Hulls
+from pregrasp_jax.robot.chain import LinkGeom, Links
+from pregrasp_jax.types import FULL_TOPOLOGY
 
 _CAPSULE_RINGS = ((9, 0.0), (6, np.deg2rad(40.0)), (1, np.deg2rad(90.0)))
 """Vertices and latitude of the rings on each half sphere, 32 in all; the best of a search over such layouts."""
 
 CAPSULE_ERROR = 0.0636
 """Largest distance between a capsule and its polyhedron, as a share of the radius: 3.8 mm at a UR5e's shoulder."""
-
-
-class LinkGeom(NamedTuple):
-    """One collision geom, as the points whose hull it is, grown by a radius (0 for a box).
-
-    Attributes:
-        name: as in the MJCF.
-        link: index into `Links.names`.
-        points: [2, 3] ends of a capsule or [8, 3] corners of a box, m in the link frame.
-        radius: m.
-    """
-
-    name: str
-    link: int
-    points: np.ndarray
-    radius: float
-
-
-@dataclass(frozen=True, eq=False)
-class Links:
-    """The L bodies of a robot, parents first; everything is a host array.
-
-    Attributes:
-        names: as in the MJCF.
-        parents: [L] int, index of the parent link, -1 for the world.
-        fixed: [L, 4, 4] pose in the parent at joint position 0.
-        to_axis: [L, 4, 4] rotation of z onto the joint axis.
-        joint: [L] int, index into the joints of the joint that moves it; 0 where nothing does.
-        turn: [L] rad per unit of that joint; 0 where it does not turn, -1 where it mirrors another finger.
-        slide: [L] m per unit of that joint; 0 where it does not slide.
-        ancestors: [R, L] int, the ancestors 1, 2, 4, ... steps above; L is the world.
-        geoms: collision geoms in the order of the MJCF.
-        hulls: one per geom at `FULL_TOPOLOGY`, in link frames. Boxes are exact; a capsule's polyhedron straddles its
-            surface within `CAPSULE_ERROR` of its radius.
-        hull_links: [M] int32, the link of each hull.
-    """
-
-    names: tuple[str, ...]
-    parents: np.ndarray
-    fixed: np.ndarray
-    to_axis: np.ndarray
-    joint: np.ndarray
-    turn: np.ndarray
-    slide: np.ndarray
-    ancestors: np.ndarray
-    geoms: tuple[LinkGeom, ...]
-    hulls: Hulls
-    hull_links: np.ndarray
-
-    def matrices(self, joint_pos: jax.Array) -> jax.Array:
-        """Return the homogeneous world poses [L, 4, 4] for joint positions [J]; see `poses`.
-
-        All links at once, in log2(depth) rounds: each is multiplied onto its ancestor 1, 2, 4, ... steps above. The
-        rounds are a scan because XLA fuses an unrolled chain into one expression that takes minutes to compile.
-        """
-        angle = joint_pos[self.joint] * self.turn
-        cos, sin, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
-        rise = joint_pos[self.joint] * self.slide if self.slide.any() else zero
-        motion = [[cos, -sin, zero, zero], [sin, cos, zero, zero], [zero, zero, one, rise], [zero, zero, zero, one]]
-        about_z = jnp.stack([jnp.stack(row, axis=-1) for row in motion], axis=-2)
-        start = self.fixed @ self.to_axis
-        world = matrix_product(matrix_product(start, about_z), self.to_axis.swapaxes(1, 2))
-
-        def climb(world: jax.Array, ancestor: jax.Array) -> tuple[jax.Array, None]:
-            # The extra row is the world, the ancestor of whatever has run out of parents.
-            padded = jnp.concatenate([world, jnp.eye(4)[None]])
-            return matrix_product(padded[ancestor], world), None
-
-        return jax.lax.scan(climb, world, jnp.asarray(self.ancestors))[0]
-
-    def poses(self, joint_pos: jax.Array) -> jax.Array:
-        """Return the world poses [L, 7] for joint positions [J]. Agrees with MuJoCo's kinematics within 1e-6."""
-        return jax.vmap(matrix_to_pose)(self.matrices(joint_pos))
 
 
 def make_links(mj_model: mujoco.MjModel, joints: Sequence[str]) -> Links:

@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from pregrasp_jax.robot import clearance, closing_region, description, kinematics
+from pregrasp_jax.robot import clearance, closing_region, description, following, kinematics
 from pregrasp_jax.robot.base import ClosingRegion, Eligibility, Robot, first_obstruction, hand_pose_of
-from pregrasp_jax.robot.links import LinkGeom, Links, make_links
+from pregrasp_jax.robot.chain import LinkGeom, Links
+from pregrasp_jax.robot.following import Body
+from pregrasp_jax.robot.links import make_links
 from pregrasp_jax.spaces.workspace import Workspace
 from pregrasp_jax.types import CTRL_DT, HandPose, HullBank
 
@@ -18,9 +20,6 @@ FINGER_CLOSED, FINGER_OPEN = (float(limit) for limit in description.joint_range(
 
 START = hand_pose_of((-0.30, 0.0), z=0.1, yaw=0.0, aperture=FINGER_OPEN)
 """The near side of the table, pointing +x, open."""
-
-MAX_JOINT_SPEED = 3.14
-"""rad/s, 180 degrees per second for every joint (UR5e data sheet)."""
 
 CLOSING_REGION_SIZE = (0.0855, 0.110)
 """m, depth (palm at 145.6 mm to fingertip at 231.1 mm from the flange) and width of what the closing fingers sweep."""
@@ -32,7 +31,8 @@ MAX_TARGET_WIDTH = 0.105
 def make_robot() -> Robot:
     """Return the robot; reads its MJCF."""
     links = make_links(description.robot_model(), description.JOINTS)
-    home = _home(links)
+    home, mirrored_home = _homes(links)
+    body = Body(arm=description.arm(), links=links, above_table=above_table(links), moving=moving(links))
 
     def clear_of(joint_pos: jax.Array, workspace: Workspace) -> jax.Array:
         table = clearance.height_above_table(links, above_table(links), joint_pos)
@@ -44,15 +44,17 @@ def make_robot() -> Robot:
         actuators=description.ACTUATORS,
         start=START,
         home=home,
+        mirrored_home=mirrored_home,
         links=links,
         attach=description.attach,
         set_home=functools.partial(_set_home, home=home),
-        hand_pose=lambda joint_pos: kinematics.grasp_pose(joint_pos[:6]),
-        follow=functools.partial(follow, links),
+        hand_pose=lambda joint_pos: kinematics.grasp_pose(body.arm, joint_pos[:6]),
+        follow=functools.partial(follow, body),
         clearance=clear_of,
         closing_region=region,
         eligibility=eligibility,
         grasp_aperture=FINGER_CLOSED,
+        body=body,
     )
 
 
@@ -81,58 +83,36 @@ def eligibility(bank: HullBank) -> Eligibility:
 
 
 def follow(
-    links: Links, joint_pos: jax.Array, poses: jax.Array, apertures: jax.Array, workspace: Workspace
+    body: Body, joint_pos: jax.Array, poses: jax.Array, apertures: jax.Array, workspace: Workspace
 ) -> tuple[jax.Array, jax.Array]:
-    """Follow poses of the grasp point; see `Robot.follow`.
+    """Follow poses of the grasp point; see `Robot.follow` and `following.follow`.
 
-    Every row is solved in closed form; the branch is the one nearest to the current joints at the first row and is
-    kept, so that the arm never jumps between postures. Commands have velocity feed-forward, and are 0 where there is no
-    solution.
+    Commands have velocity feed-forward, and are 0 where there is no solution.
     """
-    joints = joint_pos[:6]
-    branches = jax.vmap(kinematics.hand_inverse_kinematics)(poses)
-    candidates = kinematics.unwrap_near(branches[0], joints)
-    gap = jnp.max(jnp.abs(candidates - joints[None]), axis=-1)
-    branch = jnp.argmin(jnp.where(jnp.isnan(gap), jnp.inf, gap))
-    path = jnp.unwrap(branches[:, branch], axis=0)
-    path += (candidates[branch] - path[0])[None]
-    velocity = jnp.asarray(jnp.gradient(path, CTRL_DT, axis=0))
-    solved = ~jnp.any(jnp.isnan(path) | jnp.isnan(velocity), axis=-1)
-    path, velocity = (jnp.where(solved[:, None], x, 0.0) for x in (path, velocity))
-    low, high = kinematics.joint_limits().T
-    within = (path >= low[None]) & (path <= high[None]) & (jnp.abs(velocity) <= MAX_JOINT_SPEED)
-    holds = {
-        "no_ik": ~solved,
-        "joint_limit": ~jnp.all(within, axis=-1),
-        **_too_near(links, path, apertures, workspace),
-    }
+    found = following.follow(body, joint_pos[:6], poses, apertures, workspace, dt=CTRL_DT)
     lead = jnp.asarray(description.feed_forward()[:6], jnp.float32)[None]
-    return jnp.concatenate([path + lead * velocity, apertures[:, None]], axis=1), first_obstruction(holds)
+    controls = jnp.concatenate([found.path + lead * found.velocity, apertures[:, None]], axis=1)
+    return controls, first_obstruction(found.holds)
 
 
-def _too_near(links: Links, path: jax.Array, apertures: jax.Array, workspace: Workspace) -> dict[str, jax.Array]:
-    """Return [T] bool for table and walls: whether arm joints [T, 6] bring the robot nearer than the margin."""
-    joints = jnp.concatenate([path, apertures[:, None], apertures[:, None]], axis=1)
-    height = jax.vmap(lambda q: clearance.height_above_table(links, above_table(links), q))(joints)
-    found = {"table": ~(height >= clearance.CLEARANCE_MARGIN)}
-    if workspace.walls:
-        beside = jax.vmap(lambda q: clearance.distance_to_walls(links, moving(links), q, workspace))(joints)
-        found["wall"] = ~(beside >= clearance.CLEARANCE_MARGIN)
-    return found
+def _homes(links: Links) -> tuple[np.ndarray, np.ndarray]:
+    """Return joint positions [8] at the start, rad, and their mirror image in the plane y = 0, in which the start lies.
 
-
-def _home(links: Links) -> np.ndarray:
-    """Return joint positions [8] at the start, rad: the least bent of the solutions that keep clear of the table."""
+    The first is the least bent of the solutions that keep clear of the table. In its mirror image shoulder, wrist and
+    elbow are on the other side.
+    """
 
     @jax.jit
     def solve(pose: jax.Array) -> jax.Array:
-        solutions = kinematics.hand_inverse_kinematics(pose)
+        solutions = kinematics.hand_inverse_kinematics(description.arm(), pose)
         joints = jnp.concatenate([solutions, jnp.full((len(solutions), 2), FINGER_OPEN)], axis=1)
         height = jax.vmap(lambda q: clearance.height_above_table(links, above_table(links), q))(joints)
         clear = height > clearance.CLEARANCE_MARGIN
-        return solutions[jnp.argmin(jnp.where(clear, jnp.linalg.norm(solutions, axis=-1), jnp.inf))]
+        branch = jnp.argmin(jnp.where(clear, jnp.linalg.norm(solutions, axis=-1), jnp.inf))
+        return joints[jnp.stack([branch, len(solutions) - 1 - branch])]
 
-    return np.append(solve(_pose(START)), [FINGER_OPEN, FINGER_OPEN]).astype(np.float32)
+    home, mirrored_home = np.asarray(solve(_pose(START)), np.float32)
+    return home, mirrored_home
 
 
 def _pose(hand: HandPose) -> np.ndarray:

@@ -149,15 +149,16 @@ class Packer:
         return accepted
 
 
-def slot_gaps(model: SlotModel, mj_model: mujoco.MjModel, data: mujoco.MjData, present: np.ndarray) -> np.ndarray:
+def slot_gaps(
+    model: SlotModel, mj_model: mujoco.MjModel, data: mujoco.MjData, present: np.ndarray, *, reach: float = 0.05
+) -> np.ndarray:
     """Return the signed distances [n, n] m between the n present objects; the diagonal is inf.
 
-    Distances beyond 5 cm may be reported as 5 cm. Source: `mj_geomDistance` over all pairs of hulls.
+    Distances beyond `reach` m may be reported as that. Source: `mj_geomDistance` over all pairs of hulls.
     """
     mujoco.mj_kinematics(mj_model, data)
     slots = np.flatnonzero(present)
     gaps = np.full((len(slots), len(slots)), np.inf)
-    reach = 0.05
     for i, a in enumerate(slots):
         for j, b in enumerate(slots[:i]):
             gap = min(

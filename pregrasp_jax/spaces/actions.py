@@ -39,6 +39,17 @@ class Bound:
     high: float
     unit: str
 
+    def refuse(self, value: float) -> None:
+        """Refuse a value beyond the bounds.
+
+        Raises:
+            ValueError: one line says which is allowed.
+        """
+        if not self.low <= value <= self.high:
+            raise ValueError(
+                f"{self.name} = {value:g} {self.unit} is out of range; allowed is {self.low} to {self.high}"
+            )
+
 
 @dataclass(frozen=True)
 class ActionSpace:

@@ -6,6 +6,7 @@ its `StepResult` says terminated or truncated.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,19 +15,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax import geometry, heightmap, startup
+from pregrasp_jax.assets import spread
+from pregrasp_jax.assets.bank import concatenate
 from pregrasp_jax.assets.sets import load_bank_for
+from pregrasp_jax.assets.variants import MakingProgress, variant_bank
 from pregrasp_jax.config import Config, TaskConfig
+from pregrasp_jax.heightmap import SENSORS, Sensor
 from pregrasp_jax.physics import make_engine
 from pregrasp_jax.physics.base import Engine
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.robot.base import Robot
-from pregrasp_jax.robot.clearance import CLEARANCE_MARGIN
 from pregrasp_jax.scene import bank as scene_bank
-from pregrasp_jax.scene.bank import SceneBank, Split
-from pregrasp_jax.scene.packing import MAX_RADIUS
+from pregrasp_jax.scene.bank import SPLITS, SceneBank, Split
 from pregrasp_jax.spaces import grid
-from pregrasp_jax.spaces.workspace import Workspace, get_workspace
+from pregrasp_jax.spaces.workspace import Workspace
 from pregrasp_jax.task import grasp, registry
+from pregrasp_jax.task.place import place_of, refuse_blocked, refuse_scenes, refuse_walls
 from pregrasp_jax.task.primitive import Plan, Primitive
 from pregrasp_jax.task.rules import Rules
 from pregrasp_jax.types import (
@@ -40,6 +44,11 @@ from pregrasp_jax.types import (
     SceneParams,
     StepResult,
 )
+
+CLEAN = SENSORS["clean"]
+
+_VARIANTS = 1
+"""Tells the key that draws variants of objects from those of images."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +66,8 @@ class Env:
         scenes: the packed scenes of one split.
         engine: physics.
         max_distance: m, longest push that is planned.
+        sensor: what the pinhole camera and the masks get wrong.
+        num_variants: of every object in the bank, which differ in mass and friction; an episode draws among them.
     """
 
     task: TaskConfig
@@ -69,6 +80,17 @@ class Env:
     scenes: SceneBank
     engine: Engine
     max_distance: float
+    sensor: Sensor = CLEAN
+    num_variants: int = 1
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the mirror image of an episode in the plane y = 0 is an episode of the same task.
+
+        Between walls the arm counts, so that it has to start in its mirror image too.
+        """
+        arm = self.task.mirrored_start and self.robot.mirrored_home is not None
+        return self.workspace.symmetric and (arm or not self.workspace.walls)
 
     def reset(self, key: jax.Array) -> EnvState:
         """Return a random scene of the bank under a random yaw with a random eligible target."""
@@ -84,14 +106,13 @@ class Env:
         yaw, target = jnp.asarray(self.scenes.yaw)[index], jnp.asarray(self.scenes.target)[index]
         return self.start(self._scene(index, yaw, target), index)
 
-    def step(
-        self, state: EnvState, action: jax.Array, *, execute: jax.Array | bool = True
-    ) -> tuple[EnvState, StepResult]:
+    def step(self, state: EnvState, action: Any, *, execute: jax.Array | bool = True) -> tuple[EnvState, StepResult]:
         """Push, look, judge.
 
         Args:
             state: a running scene.
-            action: () int32 flat index of Q[row, col, choice]; it need not be allowed by `action_mask`.
+            action: () int32 flat index of Q[row, col, choice], or what else the primitive takes; it need not be allowed
+                by `action_mask`.
             execute: () bool; False refuses the push as if it were out of reach, which costs no physics. For searches
                 that are through with one scene of a batch.
 
@@ -101,7 +122,7 @@ class Env:
         plan = self.plan(state, action).unless(~jnp.asarray(execute), "no_ik")
         return self.conclude(state, plan, self.engine.run(state.physics, plan.ctrl, plan.num_ctrl))
 
-    def plan(self, state: EnvState, action: jax.Array) -> Plan:
+    def plan(self, state: EnvState, action: Any) -> Plan:
         """Return the motion of a push, reachable or not; see `step`."""
         return self.primitive.plan(state.physics_obs.joint_pos, self.primitive.decode(state.hand, action))
 
@@ -130,16 +151,16 @@ class Env:
     def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> GraspResult:
         """Close with constant force, lift 0.2 m, hold 5 s. Without `execute` () bool nothing is held, at no cost."""
         plan = self.plan_grasp(state).unless(~jnp.asarray(execute), "no_ik")
-        return self.conclude_grasp(state, self.engine.run(state.physics, plan.ctrl, plan.num_ctrl))
+        return self.conclude_grasp(state, plan, self.engine.run(state.physics, plan.ctrl, plan.num_ctrl))
 
-    def conclude_grasp(self, state: EnvState, physics: Any) -> GraspResult:
+    def conclude_grasp(self, state: EnvState, plan: Plan, physics: Any) -> GraspResult:
         """Return whether the grasp holds, once `physics` has run through its plan."""
-        return grasp.judge_grasp(self.robot, self.bank, state, self.engine.observe(physics))
+        return grasp.judge_grasp(self.robot, self.bank, state, plan, self.engine.observe(physics))
 
     def start(self, scene: SceneParams, index: jax.Array | int = -1) -> EnvState:
         """Return any scene with the hand at the start; `index` is its row of the bank, -1 for none."""
         blank = jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8)
-        physics = self.engine.reset(self.engine.init(), scene)
+        physics = self.engine.reset(self.engine.init(), scene, self._starts_mirrored(scene))
         hand = jax.tree.map(jnp.asarray, self.robot.start)
         state = EnvState(
             physics=physics,
@@ -152,11 +173,28 @@ class Env:
         )
         return self.look(state, hand)
 
+    def _starts_mirrored(self, scene: SceneParams) -> jax.Array | bool:
+        """Return () bool, whether the arm starts in the mirror image of its posture; see `TaskConfig.mirrored_start`.
+
+        The mirror image of a scene then starts with the mirror image of the arm.
+        """
+        return bool(self.task.mirrored_start and self.workspace.walls) and scene.poses[scene.target, 1] < 0
+
     def _scene(self, index: jax.Array, yaw: jax.Array, target: jax.Array) -> SceneParams:
         """Return scene `index` of the bank turned by `yaw` about the centre."""
         object_ids, poses = jnp.asarray(self.scenes.object_ids)[index], jnp.asarray(self.scenes.poses)[index]
         turned = jax.vmap(functools.partial(_turn, yaw=yaw))(poses)
-        return SceneParams(object_ids, jnp.where((object_ids >= 0)[:, None], turned, poses), target.astype(jnp.int32))
+        target, poses = target.astype(jnp.int32), jnp.where((object_ids >= 0)[:, None], turned, poses)
+        return SceneParams(self._drawn(object_ids, heightmap.episode_key(self.sensor, poses, target)), poses, target)
+
+    def _drawn(self, object_ids: jax.Array, episode: jax.Array) -> jax.Array:
+        """Return object ids [MAX_OBJECTS] with a variant of each object, as the episode draws them."""
+        if self.num_variants == 1:
+            return object_ids
+        key = jax.random.fold_in(episode, _VARIANTS)
+        variant = jax.random.randint(key, object_ids.shape, 0, self.num_variants)
+        num_objects = len(self.bank.names) // self.num_variants
+        return jnp.where(object_ids >= 0, object_ids + num_objects * variant, object_ids)
 
     def look(self, state: EnvState, hand: HandPose | None = None) -> EnvState:
         """Return the state with everything that is seen or measured brought up to date with its physics.
@@ -169,12 +207,31 @@ class Env:
         hulls = heightmap.scene_hulls(self.bank, self.robot, state.scene, physics_obs, self.workspace)
         com = jnp.asarray(self.bank.com)[state.scene.object_ids]
         centroids = jax.vmap(geometry.transform_points)(physics_obs.object_poses, com)
-        obs = heightmap.observe(hulls, state.hand if hand is None else hand, camera=self.task.camera)
+        hand = state.hand if hand is None else hand
+        obs = heightmap.observe(hulls, hand, camera=self.task.camera, look=self._camera(state))
         return state.replace(physics_obs=physics_obs, obs=obs, centroids=centroids)
+
+    def _camera(self, state: EnvState) -> Callable[..., Any]:
+        """Return what the pinhole camera makes of hulls in this state."""
+        if self.sensor == CLEAN:
+            return heightmap.pinhole
+        scene = state.scene
+        return functools.partial(
+            heightmap.sense,
+            self.sensor,
+            episode=heightmap.episode_key(self.sensor, scene.poses, scene.target),
+            num_pushes=state.num_pushes,
+            target=scene.target,
+        )
 
 
 def make_env(
-    config: Config, *, split: Split, threads: int | None = None, progress: scene_bank.PackingProgress | None = None
+    config: Config,
+    *,
+    split: Split,
+    threads: int | None = None,
+    progress: scene_bank.PackingProgress | None = None,
+    making: MakingProgress | None = None,
 ) -> Env:
     """Load the objects, load or pack the scenes of a split, and compile an engine of this environment's own.
 
@@ -183,18 +240,45 @@ def make_env(
         split: `train`, `validation` or `test`.
         threads: overrides `config.physics.threads`.
         progress: told about scenes packed so far, if any must be packed.
+        making: told about objects made so far, if any must be made.
 
     Raises:
         ValueError: the objects or settings cannot be used; one line says why.
     """
     startup.check()
     threads = config.physics.threads if threads is None else threads
-    refuse_walls(get_robot(config.task.robot), get_workspace(config.task.workspace))
+    refuse_walls(get_robot(config.task.robot), place_of(config.task))
     registry.get_kind(config.task.primitive)  # before anything is packed
-    bank = load_bank_for(config.assets.object_dir, config.assets.object_set)
+    sensor_of(config.task)
+    bank = load_split_bank(config, split, making=making)
     eligible = eligible_targets(get_robot(config.task.robot), bank, origin=str(config.assets.object_dir or "built in"))
     scenes = scene_bank.load_or_build(bank, eligible, config.scene, split, threads=threads, progress=progress)
-    return assemble(config, bank, scenes, eligible=eligible, threads=threads)
+    refuse_scenes(place_of(config.task), scenes)
+    env = assemble(config, bank, scenes, eligible=eligible, threads=threads)
+    refuse_blocked(env.robot, env.workspace, env.primitive)
+    return env
+
+
+def load_split_bank(config: Config, split: Split, *, making: MakingProgress | None = None) -> HullBank:
+    """Return the objects of a split: those of the set, and with `assets.variants` what is made beside them.
+
+    Training meets both. Validation and test meet made objects only, others than training does, so that a run is judged
+    by shapes that it has not seen without looking at any set that is reported.
+
+    Args:
+        config: the run's configuration.
+        split: `train`, `validation` or `test`.
+        making: told about objects made so far, if any must be made.
+
+    Raises:
+        ValueError: the objects cannot be used.
+    """
+    assets = config.assets
+    known = load_bank_for(assets.object_dir, assets.object_set)
+    if not assets.variants:
+        return known
+    made = variant_bank(known, assets.variants, seed=(config.scene.bank_seed, SPLITS.index(split)), progress=making)
+    return concatenate([known, made]) if split == "train" else made
 
 
 def assemble(
@@ -209,13 +293,38 @@ def assemble(
         eligible: [N] bool, from `eligible_targets`, where that is known.
         threads: of the native engine; 0 takes every core.
     """
-    robot, workspace = get_robot(config.task.robot), get_workspace(config.task.workspace)
+    robot, workspace = get_robot(config.task.robot), place_of(config.task)
     refuse_walls(robot, workspace)
     eligible = eligible_targets(robot, bank) if eligible is None else eligible
-    reach = longest_push(config)
+    reach, sensor, num_variants = longest_push(config), sensor_of(config.task), 1
+    if _spread(sensor) != _spread(CLEAN):
+        mass_spread, friction_spread = _spread(sensor)
+        bank = spread.vary(bank, mass_spread=mass_spread, friction_spread=friction_spread, seed=sensor.seed)
+        num_variants, eligible = spread.NUM_VARIANTS, np.tile(eligible, spread.NUM_VARIANTS)
     parts = make_task(config.task, robot, workspace, bank, max_distance=reach)
-    engine = make_engine(config.physics.engine, bank, robot, workspace, threads=threads)
-    return Env(config.task, workspace, robot, *parts, bank, eligible, scenes, engine, reach)
+    engines = registry.get_kind(config.task.primitive).engines
+    engine = make_engine(config.physics.engine, bank, robot, workspace, threads=threads, engines=engines)
+    return Env(config.task, workspace, robot, *parts, bank, eligible, scenes, engine, reach, sensor, num_variants)
+
+
+def sensor_of(task: TaskConfig) -> Sensor:
+    """Return the sensor of a task.
+
+    Raises:
+        ValueError: there is none of this name, its file cannot be used, or the camera is not the pinhole.
+    """
+    sensor = heightmap.get_sensor(task.sensor)
+    if sensor != CLEAN and task.camera != "pinhole":
+        raise ValueError(
+            f"task.sensor = {task.sensor!r} is what a pinhole camera gets wrong, but task.camera = {task.camera!r}; "
+            "allowed with it is pinhole"
+        )
+    return sensor
+
+
+def _spread(sensor: Sensor) -> tuple[float, float]:
+    """Return how far objects differ from their models, in mass and in friction."""
+    return sensor.mass_spread, sensor.friction_spread
 
 
 def eligible_targets(robot: Robot, bank: HullBank, *, origin: str = "hull bank") -> np.ndarray:
@@ -257,39 +366,26 @@ def make_task(
     return primitive, kind.make_rules(robot, workspace, primitive, bank, task)
 
 
-def refuse_walls(robot: Robot, workspace: Workspace) -> None:
-    """Refuse a place whose walls are where the robot starts or where scenes are packed.
-
-    Raises:
-        ValueError: one line says which wall, and what is allowed.
-    """
-    for index, wall in enumerate(workspace.walls):
-        alone = dataclasses.replace(workspace, walls=(wall,))
-        reach = wall.distance_to_origin()
-        if reach < MAX_RADIUS:
-            raise ValueError(
-                f"workspace '{workspace.name}': wall {index} comes within {reach:.3f} m of the centre, where scenes "
-                f"are packed; allowed is {MAX_RADIUS} m or more"
-            )
-        clear = float(robot.clearance(jnp.asarray(robot.home), alone))
-        if clear < CLEARANCE_MARGIN:
-            raise ValueError(
-                f"workspace '{workspace.name}': wall {index} is {clear:.3f} m from robot {robot.name} at its start "
-                f"pose; allowed is {CLEARANCE_MARGIN} m or more"
-            )
-
-
 def longest_push(config: Config) -> float:
     """Return the length, m, of the longest push that is planned: unguided exploration goes anywhere at once."""
     return config.task.r_out if config.exploration.guided else float(np.hypot(0.5, 0.5) + 0.1)
 
 
 def with_task(env: Env, **changes: object) -> Env:
-    """Return the same scenes and engine under a changed task, for example another `r_out` or camera."""
+    """Return the same scenes and engine under a changed task, for example another `r_out` or camera.
+
+    Raises:
+        ValueError: a sensor under which the objects themselves would be others.
+    """
     task = dataclasses.replace(env.task, **changes)  # pyright: ignore[reportArgumentType]
+    sensor = sensor_of(task)
+    if (_spread(sensor), sensor.seed) != (_spread(env.sensor), env.sensor.seed) and _spread(sensor) != _spread(CLEAN):
+        raise ValueError(
+            f"task.sensor = {task.sensor!r} has other objects than {env.task.sensor!r}; allowed is `make_env`"
+        )
     reach = max(env.max_distance, task.r_out)
     primitive, rules = make_task(task, env.robot, env.workspace, env.bank, max_distance=reach)
-    return dataclasses.replace(env, task=task, primitive=primitive, rules=rules, max_distance=reach)
+    return dataclasses.replace(env, task=task, primitive=primitive, rules=rules, max_distance=reach, sensor=sensor)
 
 
 def _turn(pose: jax.Array, *, yaw: jax.Array) -> jax.Array:

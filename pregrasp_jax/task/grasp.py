@@ -4,8 +4,9 @@ import jax.numpy as jnp
 
 from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.robot.closing_region import scene_coverage
+from pregrasp_jax.spaces.motion import minimum_jerk
 from pregrasp_jax.spaces.workspace import Workspace
-from pregrasp_jax.task.primitive import Plan, follow, minimum_jerk
+from pregrasp_jax.task.primitive import Plan, follow
 from pregrasp_jax.types import CTRL_DT, EnvState, GraspResult, HandPose, HullBank, PhysicsObservation
 
 LIFT_HEIGHT, LIFT_SPEED = 0.2, 0.1
@@ -35,7 +36,7 @@ def plan_grasp(robot: Robot, workspace: Workspace, state: EnvState) -> Plan:
     return follow(robot, workspace, joint_pos, path, num_ctrl=num_ctrl, seconds=jnp.float32(seconds), hand=hand)
 
 
-def judge_grasp(robot: Robot, bank: HullBank, before: EnvState, after: PhysicsObservation) -> GraspResult:
+def judge_grasp(robot: Robot, bank: HullBank, before: EnvState, plan: Plan, after: PhysicsObservation) -> GraspResult:
     """Return whether the target was lifted and is still between the fingers."""
     target = before.scene.target
     rise = after.object_poses[target, 2] - before.physics_obs.object_poses[target, 2]
@@ -43,4 +44,4 @@ def judge_grasp(robot: Robot, bank: HullBank, before: EnvState, after: PhysicsOb
     region = robot.closing_region(before.hand.aperture)
     coverage = scene_coverage(bank, before.scene.object_ids, after.object_poses, after.hand_pose, region)
     held = (rise > _MIN_LIFT) & (coverage[target] > 0) & ~after.diverged
-    return GraspResult(held, after.diverged, after.overflows)
+    return GraspResult(held, after.diverged, after.overflows, plan.obstruction)

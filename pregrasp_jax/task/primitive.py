@@ -36,6 +36,7 @@ class Plan(struct.PyTreeNode):
         seconds: () float32 s, how long the motion takes; 0 if nothing may be executed.
         obstruction: () int32 index into `OBSTRUCTIONS`.
         hand: commanded end of the motion, executed or not.
+        stroke: what it was planned for, where rules ask for that.
     """
 
     ctrl: Any
@@ -43,6 +44,7 @@ class Plan(struct.PyTreeNode):
     seconds: jax.Array
     obstruction: jax.Array
     hand: HandPose
+    stroke: Stroke | None = None
 
     @property
     def reachable(self) -> jax.Array:
@@ -52,7 +54,7 @@ class Plan(struct.PyTreeNode):
     def unless(self, refused: jax.Array, obstruction: str) -> "Plan":
         """Return the plan, or one that executes nothing where `refused` () bool and nothing else was in the way."""
         code = jnp.where(self.reachable & refused, OBSTRUCTIONS.index(obstruction), self.obstruction)
-        return make_plan(self.ctrl, self.num_ctrl, self.seconds, code, self.hand)
+        return make_plan(self.ctrl, self.num_ctrl, self.seconds, code, self.hand).replace(stroke=self.stroke)
 
 
 def make_plan(ctrl: Any, num_ctrl: jax.Array, seconds: jax.Array, obstruction: jax.Array, hand: HandPose) -> Plan:
@@ -75,15 +77,25 @@ class Primitive:
         name: as in `TaskConfig.primitive`.
         actions: what an index means.
         mask: (hand) -> [H, W, K] bool, which actions are allowed next.
-        decode: (hand, action () int32) -> `Stroke`.
+        decode: (hand, action) -> `Stroke`; an action is () int32, a flat index, or whatever else the primitive takes.
         plan: (joint_pos [J], stroke) -> `Plan`.
+        normal: (action) -> the form in which actions are kept.
+        motions: motions that people count for one action.
+        choice_of: (action in its normal form) -> which of the choices it is, () int32; None for flat indices.
     """
 
     name: str
     actions: ActionSpace
     mask: Callable[[HandPose], jax.Array]
-    decode: Callable[[HandPose, jax.Array], Stroke]
-    plan: Callable[[jax.Array, Stroke], Plan]
+    decode: Callable[[HandPose, Any], Stroke]
+    plan: Callable[[jax.Array, Any], Plan]
+    normal: Callable[[Any], Any] = lambda action: action
+    motions: int = 1
+    choice_of: Callable[[Any], Any] | None = None
+
+    def choice(self, action: Any) -> Any:
+        """Return which of the choices () int32 an action is: whose Q map it is drawn on."""
+        return self.actions.unravel(action)[2] if self.choice_of is None else self.choice_of(action)
 
 
 def follow(
@@ -111,12 +123,3 @@ def follow(
     ctrl, code = robot.follow(joint_pos, poses, path.aperture, workspace)
     first = code[jnp.argmax(code != OBSTRUCTIONS.index("none"))]
     return make_plan(ctrl, num_ctrl, seconds, first, hand).unless(num_ctrl > len(ctrl), "too_long")
-
-
-def minimum_jerk(share: jax.Array) -> jax.Array:
-    """Return the travelled share [...] of a minimum-jerk motion after a `share` [...] of its time, clipped to [0, 1].
-
-    Source: Flash and Hogan 1985, 10 s^3 - 15 s^4 + 6 s^5.
-    """
-    s = jnp.clip(share, 0.0, 1.0)
-    return s**3 * (10 - 15 * s + 6 * s**2)

@@ -11,20 +11,12 @@ import jax.numpy as jnp
 
 from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.robot.base import Robot
-from pregrasp_jax.spaces import grid
+from pregrasp_jax.spaces import grid, motion
 from pregrasp_jax.spaces.actions import ActionSpace, Choice
+from pregrasp_jax.spaces.motion import APERTURE_TIME, SETTLE_TIME, TURN_SPEED
 from pregrasp_jax.spaces.workspace import Workspace
-from pregrasp_jax.task.primitive import Plan, Primitive, Stroke, follow, minimum_jerk
+from pregrasp_jax.task.primitive import Plan, Primitive, Stroke, follow
 from pregrasp_jax.types import CTRL_DT, HandPose
-
-SETTLE_TIME = 0.25
-"""s of standing still after a push."""
-
-APERTURE_TIME = 0.5
-"""s for the fingers to open or close before a push that changes the aperture."""
-
-TURN_SPEED = 1.5
-"""rad/s, mean speed of a turn: a push that turns the hand farther than its length has time for takes longer."""
 
 
 def make_push(robot: Robot, workspace: Workspace, task: TaskConfig, *, max_distance: float) -> Primitive:
@@ -88,6 +80,10 @@ def push_actions(robot: Robot) -> ActionSpace:
     return ActionSpace(choices, mirrored=(0, 1))
 
 
+def _held(hand: HandPose) -> motion.Held:
+    return motion.Held(hand.xy, hand.z, hand.yaw, hand.aperture)
+
+
 def num_push_rows(max_distance: float, push_speed: float, *, max_turn: float = 0.0) -> int:
     """Return the static number of control rows T that a push of at most `max_distance` m and `max_turn` rad needs."""
     duration = max(max_distance / push_speed, max_turn / TURN_SPEED)
@@ -114,18 +110,8 @@ def plan_push(
         num_rows: static number of rows T, from `num_push_rows`.
     """
     start, end = stroke.start, stroke.end
-    distance = jnp.linalg.norm(end.xy - start.xy)
-    wait = jnp.where(jnp.abs(end.aperture - start.aperture) < 1e-6, 0.0, APERTURE_TIME)
-    turn = jnp.mod(end.yaw - start.yaw + jnp.pi, 2 * jnp.pi) - jnp.pi
-    duration = jnp.maximum(jnp.maximum(distance / push_speed, jnp.abs(turn) / TURN_SPEED), CTRL_DT)
-    time = CTRL_DT * jnp.arange(num_rows)
-    share = minimum_jerk((time - wait) / duration)
-    path = HandPose(
-        xy=start.xy[None] + share[:, None] * (end.xy - start.xy)[None],
-        z=start.z + share * (end.z - start.z),
-        yaw=start.yaw + share * turn,
-        aperture=start.aperture + minimum_jerk(time / APERTURE_TIME) * (end.aperture - start.aperture),
-    )
-    seconds = wait + duration + SETTLE_TIME
+    times = CTRL_DT * jnp.arange(num_rows)
+    line = motion.straight_line(_held(start), _held(end), times, push_speed=push_speed, shortest=CTRL_DT)
+    path, seconds = HandPose(line.xy, line.z, line.yaw, line.aperture), line.seconds
     num_ctrl = jnp.ceil(seconds / CTRL_DT - 1e-3).astype(jnp.int32)
     return follow(robot, workspace, joint_pos, path, num_ctrl=num_ctrl, seconds=seconds, hand=end)

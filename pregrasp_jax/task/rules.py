@@ -16,7 +16,7 @@ from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.robot.closing_region import scene_coverage
 from pregrasp_jax.spaces.workspace import Workspace
 from pregrasp_jax.task.primitive import Plan, Primitive
-from pregrasp_jax.types import REASONS, EnvState, HullBank, Outcome
+from pregrasp_jax.types import REASONS, EnvState, HullBank, Outcome, PhysicsObservation
 
 IN_REGION_COVERAGE = 0.95
 """An object is in the closing region if more than this share of its projection is (Sec. III-D)."""
@@ -60,12 +60,14 @@ class Rules:
         hindsight_goal: (outcome, goal, eligible [MAX_OBJECTS] bool) -> slot () int32 and found () bool: the object for
             which an episode that ends with this outcome was a success, if there is one.
         successes: reasons that count as success, indices into `REASONS`.
+        asks_for_grasp: whether a success has yet to be grasped, by `Env.grasp`.
     """
 
     measure: Callable[[EnvState, EnvState, Plan], Outcome]
     judge: Callable[[Outcome, jax.Array], Verdict]
     hindsight_goal: Callable[[Outcome, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
     successes: tuple[int, ...]
+    asks_for_grasp: bool = True
 
     def succeeded(self, reason: jax.Array) -> jax.Array:
         """Return [...] bool, which reasons [...] count as success."""
@@ -89,6 +91,7 @@ def make_rules(robot: Robot, workspace: Workspace, primitive: Primitive, bank: H
         seen, hand = after.physics_obs, after.hand
         up_z = 1 - 2 * (seen.object_poses[:, 4] ** 2 + seen.object_poses[:, 5] ** 2)
         end_error = jnp.linalg.norm(seen.hand_pose[:3] - jnp.append(hand.xy, hand.z))
+        jammed = _jammed(workspace, seen)
         return Outcome(
             coverage=scene_coverage(
                 bank, before.scene.object_ids, seen.object_poses, seen.hand_pose, region(hand.aperture)
@@ -98,9 +101,9 @@ def make_rules(robot: Robot, workspace: Workspace, primitive: Primitive, bank: H
             distance_after=_distance(after),
             toppled=present & (up_z < jnp.cos(TOPPLED)),
             off_table=present & workspace.has_left(after.centroids),
-            obstruction=plan.unless(end_error > MAX_END_ERROR, "end_error").obstruction,
+            obstruction=plan.unless(jammed, "jammed").unless(end_error > MAX_END_ERROR, "end_error").obstruction,
             no_action=~jnp.any(primitive.mask(hand)),
-            diverged=seen.diverged,
+            diverged=seen.diverged & ~jammed,
         )
 
     return judging(lambda aperture: jnp.asarray(region(aperture).exists), task, measure=measure)
@@ -191,6 +194,18 @@ def reward_terms(outcome: Outcome, goal: jax.Array, reason: jax.Array) -> dict[s
         "target_in_region": (reason == TARGET_IN_REGION).astype(jnp.float32),
         "approach": (approached & (reason == RUNNING)).astype(jnp.float32),
     }
+
+
+def _jammed(workspace: Workspace, seen: PhysicsObservation) -> jax.Array:
+    """Return () bool, whether the hand has pressed objects against walls until they overlap too deeply.
+
+    On an open table objects give way, and such an overlap is an error of the physics. Between walls they cannot, and
+    the arm is strong enough.
+    """
+    if not workspace.walls:
+        return jnp.zeros((), bool)
+    finite = jnp.all(jnp.isfinite(seen.object_poses)) & jnp.all(jnp.isfinite(seen.joint_pos))
+    return seen.diverged & finite
 
 
 def _distance(state: EnvState) -> jax.Array:

@@ -23,8 +23,9 @@ from pregrasp_jax.task.primitive import Plan, Primitive
 from pregrasp_jax.task.rules import Rules
 from pregrasp_jax.task.stages import Stages, make_stages
 from pregrasp_jax.training.mishap import Mishap, no_mishap
+from pregrasp_jax.training.schedules import Pace
 from pregrasp_jax.training.sharding import VmapFn
-from pregrasp_jax.types import REASONS, EnvState, HandPose, StepResult
+from pregrasp_jax.types import OBSTRUCTIONS, PUSH_REASONS, EnvState, HandPose, StepResult
 
 RECENT_EPISODES = 200
 """Episodes behind `train/success_rate`, or one per scene where there are more scenes."""
@@ -81,7 +82,8 @@ class Tally(struct.PyTreeNode):
         explored: () int32 of them were random.
         overflowed: () int32 pushes since the last report, branches included, in which the engine dropped contacts.
         diverged: () int32 pushes since the last report, branches included, after which the physics made no sense.
-        reasons: [len(REASONS)] int32 why episodes ended since the last report.
+        reasons: [len(PUSH_REASONS)] int32 why episodes ended since the last report.
+        obstructions: [len(OBSTRUCTIONS)] int32 what made the last push of those unreachable that ended so.
     """
 
     env_steps: jax.Array
@@ -93,6 +95,7 @@ class Tally(struct.PyTreeNode):
     overflowed: jax.Array
     diverged: jax.Array
     reasons: jax.Array
+    obstructions: jax.Array
 
     def begin_report(self) -> "Tally":
         """Return the tally with the counts since the last report at 0."""
@@ -103,6 +106,7 @@ class Tally(struct.PyTreeNode):
             overflowed=jnp.zeros_like(self.overflowed),
             diverged=jnp.zeros_like(self.diverged),
             reasons=jnp.zeros_like(self.reasons),
+            obstructions=jnp.zeros_like(self.obstructions),
         )
 
 
@@ -152,7 +156,8 @@ def init_actors(key: jax.Array, env: Environment, num_envs: int, *, vmap: VmapFn
         explored=jnp.int32(0),
         overflowed=jnp.int32(0),
         diverged=jnp.int32(0),
-        reasons=jnp.zeros(len(REASONS), jnp.int32),
+        reasons=jnp.zeros(len(PUSH_REASONS), jnp.int32),
+        obstructions=jnp.zeros(len(OBSTRUCTIONS), jnp.int32),
     )
     states = vmap(env.reset)(jax.random.split(reset_key, num_envs))
     return Actors(states, key, tally, no_mishap(states))
@@ -166,7 +171,7 @@ def make_collect(
     warmup: int,
     vmap: VmapFn = jax.vmap,
 ) -> Stages:
-    """Return the function ``(actors, params) -> (actors, experience)``: push in every scene, reset those that ended.
+    """Return the function ``(actors, params, pace) -> (actors, experience)``: push everywhere, reset what has ended.
 
     Args:
         env: the scenes.
@@ -191,6 +196,15 @@ def make_collect(
             open_probability=config.open_probability,
         )
 
+    def promising(key: jax.Array, q: jax.Array, mask: jax.Array) -> jax.Array:
+        """Return the greedy action and what its branches try instead, [1 + branches]."""
+        if config.branch_spacing:
+            count = 1 + config.branches
+            return exploration.best_apart(q, mask, q_function.actions, count=count, spacing=config.branch_spacing)
+        draw = functools.partial(exploration.softmax_action, temperature=config.branch_temperature)
+        drawn = jax.vmap(draw, (0, None, None))(jax.random.split(key, config.branches), q, mask)
+        return jnp.concatenate([greedy_action(q, mask)[None], drawn])
+
     def act(key: jax.Array, state: EnvState, q: jax.Array, epsilon: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return actions [1 + branches] of one scene, the real one first, and which of them are random."""
         mask = env.action_mask(state.hand)
@@ -198,16 +212,13 @@ def make_collect(
         explore_keys = jax.random.split(explore_key, 1 + config.branches)
         exploratory = jax.vmap(explore, (0, None, None))(explore_keys, state, mask)
         random = jax.random.uniform(choice_key, exploratory.shape) < epsilon
-        draw = functools.partial(exploration.softmax_action, temperature=config.branch_temperature)
-        drawn = jax.vmap(draw, (0, None, None))(jax.random.split(softmax_key, config.branches), q, mask)
-        promising = jnp.concatenate([greedy_action(q, mask)[None], drawn])
-        return jnp.where(random, exploratory, promising), random
+        return jnp.where(random, exploratory, promising(softmax_key, q, mask)), random
 
-    def decide(actors: Actors, params: Params) -> tuple[Any, Plan, Any]:
+    def decide(actors: Actors, params: Params, pace: Pace) -> tuple[Any, Plan, Any]:
         states = actors.env_states
         num_envs = states.num_pushes.shape[0]
         key, action_key, reset_key = jax.random.split(actors.key, 3)
-        epsilon = epsilon_at(actors.tally.env_steps, config, warmup=warmup)
+        epsilon = epsilon_at(actors.tally.env_steps, config, warmup=warmup, decay=pace.epsilon_decay)
         q = q_function.apply(params, jax.vmap(q_function.input_fn)(states.obs, states.scene.target))
         keys = jax.random.split(action_key, num_envs)
         actions, random = jax.vmap(act, (0, 0, 0, None))(keys, states, q, epsilon)
@@ -245,11 +256,18 @@ def _with_branches(states: EnvState, config: ExplorationConfig) -> EnvState:
     return jax.tree.map(lambda leaf: jnp.concatenate([leaf] * (1 + config.branches)), states)
 
 
-def epsilon_at(env_steps: jax.Array | int, config: ExplorationConfig, *, warmup: int) -> jax.Array:
-    """Return the share of random actions () after `env_steps` pushes; 1 during the warm-up."""
-    decayed = exploration.linear_schedule(
-        env_steps, start=config.epsilon_start, end=config.epsilon_end, steps=config.epsilon_decay
-    )
+def epsilon_at(
+    env_steps: jax.Array | int, config: ExplorationConfig, *, warmup: int, decay: jax.Array | np.floating | float
+) -> jax.Array:
+    """Return the share of random actions () after `env_steps` pushes; 1 during the warm-up.
+
+    Args:
+        env_steps: so far.
+        config: where it begins and ends.
+        warmup: env steps of pure exploration.
+        decay: env steps after which it stays, see `schedules`.
+    """
+    decayed = exploration.linear_schedule(env_steps, start=config.epsilon_start, end=config.epsilon_end, steps=decay)
     return jnp.where(env_steps < warmup, 1.0, decayed)
 
 
@@ -283,6 +301,7 @@ def _count(
 ) -> Tally:
     window = tally.recent.shape[0]
     order = jnp.cumsum(ended, dtype=jnp.int32) - 1
+    unreachable = ended & (results.reason == PUSH_REASONS.index("unreachable"))
     slots = jnp.where(ended, (tally.episodes + order) % window, window)
     return Tally(
         env_steps=tally.env_steps + ended.shape[0],
@@ -294,6 +313,7 @@ def _count(
         overflowed=tally.overflowed + jnp.sum(overflowed, dtype=jnp.int32),
         diverged=tally.diverged + jnp.sum(diverged, dtype=jnp.int32),
         reasons=tally.reasons.at[results.reason].add(ended.astype(jnp.int32)),
+        obstructions=tally.obstructions.at[results.outcome.obstruction].add(unreachable.astype(jnp.int32)),
     )
 
 
@@ -316,5 +336,12 @@ def metrics(tally: Tally, successes: Sequence[int]) -> dict[str, Any]:
         "train/explored": float(counts.explored / counts.pushes) if counts.pushes else None,
         "physics/overflows": int(counts.overflowed),
         "physics/diverged": int(counts.diverged),
-        **{f"reasons/{name}": int(n) for name, n in zip(REASONS, counts.reasons, strict=True) if name != "running"},
+        **{
+            f"reasons/{name}": int(n) for name, n in zip(PUSH_REASONS, counts.reasons, strict=True) if name != "running"
+        },
+        **{
+            f"unreachable/{name}": int(n)
+            for name, n in zip(OBSTRUCTIONS, counts.obstructions, strict=True)
+            if name != "none"
+        },
     }

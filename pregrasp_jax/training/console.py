@@ -78,7 +78,10 @@ class Console:
             share: of the run that is done, 0 to 1.
             eta: s left; None if unknown.
         """
-        text = describe(row, eta)
+        self.show(describe(row, eta), share=share)
+
+    def show(self, text: str, *, share: float) -> None:
+        """Show how far a run is, `share` from 0 to 1, and any text beside it."""
         self._progress.update(self._task, completed=share, description=text)
         if not self._rich.is_terminal and time.monotonic() - self._last_line >= PLAIN_INTERVAL:
             self._last_line = time.monotonic()

@@ -4,6 +4,7 @@ The two are compiled apart and the host repeats the update: inside a loop of XLA
 lose their fast kernels and an update takes several times as long.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -18,8 +19,10 @@ from pregrasp_jax.learning import replay as replay_lib
 from pregrasp_jax.learning.learner import LearnerState
 from pregrasp_jax.learning.q_function import Params
 from pregrasp_jax.learning.replay import Replay, Steps
+from pregrasp_jax.policies.exploration import linear_schedule
 from pregrasp_jax.task.rules import Rules
 from pregrasp_jax.training.collect import Experience
+from pregrasp_jax.training.schedules import Pace
 
 
 class Learning(struct.PyTreeNode):
@@ -47,8 +50,8 @@ class Learning(struct.PyTreeNode):
 RememberFn = Callable[[Learning, Experience], Learning]
 """``(state, experience) -> state``."""
 
-UpdateFn = Callable[[Learning, Any], Learning]
-"""``(state, beta () float32) -> state``; beta is the importance exponent."""
+UpdateFn = Callable[[Learning, Any, Pace], Learning]
+"""``(state, beta () float32, pace) -> state``; beta is the importance exponent."""
 
 
 def num_updates(env_steps: int, config: LearnerConfig) -> int:
@@ -64,6 +67,7 @@ def init_learning(
     optimizer: optax.GradientTransformation,
     *,
     max_pushes: int,
+    num_siblings: int = 1,
 ) -> Learning:
     """Return a learner without experience.
 
@@ -74,10 +78,12 @@ def init_learning(
         replay_config: capacity.
         optimizer: see `make_optimizer`.
         max_pushes: longest episode.
+        num_siblings: pushes from one state that are learned from together, see `replay.init`.
     """
+    memory = replay_lib.init(steps, capacity=replay_config.capacity, max_pushes=max_pushes, num_siblings=num_siblings)
     return Learning(
         learner=learner.init(params, optimizer),
-        replay=replay_lib.init(steps, capacity=replay_config.capacity, max_pushes=max_pushes),
+        replay=memory,
         key=key,
         updates=jnp.int32(0),
         metrics={name: jnp.float32(0) for name in METRICS},
@@ -96,13 +102,19 @@ def make_remember(config: ReplayConfig, rules: Rules) -> RememberFn:
     return remember
 
 
-def make_update(**options: Any) -> UpdateFn:
+def make_update(config: LearnerConfig, **options: Any) -> UpdateFn:
     """Return the function that updates once; `options` go to `learner.sample_and_update`."""
 
-    def update(state: Learning, beta: jax.Array) -> Learning:
+    def update(state: Learning, beta: jax.Array, pace: Pace) -> Learning:
         key, sample_key = jax.random.split(state.key)
         learner_state, replay, metrics = learner.sample_and_update(
-            state.learner, state.replay, sample_key, importance_exponent=beta, **options
+            state.learner,
+            state.replay,
+            sample_key,
+            importance_exponent=beta,
+            optimizer=make_optimizer(config, pace.learning_rate_steps),
+            config=config,
+            **options,
         )
         metrics = _accumulate(state.metrics, metrics, state.updates)
         return Learning(learner_state, replay, key, state.updates + 1, metrics)
@@ -110,13 +122,17 @@ def make_update(**options: Any) -> UpdateFn:
     return update
 
 
-def make_optimizer(config: LearnerConfig) -> optax.GradientTransformation:
-    """Return Adam, its step size constant or decaying linearly."""
-    if not config.learning_rate_steps:
+def make_optimizer(config: LearnerConfig, steps: Any = math.inf) -> optax.GradientTransformation:
+    """Return Adam, its step size constant or decaying linearly.
+
+    Args:
+        config: where the step size begins and ends.
+        steps: () updates after which it stays, see `schedules`. The state of the optimizer does not depend on it.
+    """
+    if config.learning_rate_steps == 0:
         return optax.adam(config.learning_rate)
-    return optax.adam(
-        optax.linear_schedule(config.learning_rate, config.final_learning_rate, config.learning_rate_steps)
-    )
+    start, end = config.learning_rate, config.final_learning_rate
+    return optax.adam(lambda count: linear_schedule(jnp.asarray(count), start=start, end=end, steps=steps))
 
 
 METRICS = (

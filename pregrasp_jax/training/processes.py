@@ -47,7 +47,12 @@ def is_first() -> bool:
 
 def agreed(value: bool) -> bool:
     """Return what process 0 says; every process must ask."""
-    return bool(multihost_utils.broadcast_one_to_all(np.int32(value)))
+    return bool(agreed_number(value))
+
+
+def agreed_number(value: int) -> int:
+    """Return what process 0 says, at most 2^31 - 1; every process must ask."""
+    return int(multihost_utils.broadcast_one_to_all(np.int32(min(value, 2**31 - 1))))
 
 
 @contextlib.contextmanager

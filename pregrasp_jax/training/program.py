@@ -1,6 +1,7 @@
 """The compiled parts of a training and the state that they share."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -24,6 +25,7 @@ from pregrasp_jax.training.learn import (
     make_remember,
     make_update,
 )
+from pregrasp_jax.training.schedules import Pace, known_length, make_pace
 from pregrasp_jax.training.sharding import Layout
 
 POLICY = "learning/learner/target_params/"
@@ -58,8 +60,8 @@ class TrainState(struct.PyTreeNode):
         return Ring(replay.observations, int(replay.observations_written))
 
 
-IterateFn = Callable[[TrainState, Any, Any], TrainState]
-"""``(state, updates [K] int32, beta [K] float32) -> state`` after K iterations, with so many updates in each."""
+IterateFn = Callable[[TrainState, Any, Any, Pace], TrainState]
+"""``(state, updates [K] int32, beta [K] float32, pace) -> state`` after K iterations, with so many updates in each."""
 
 
 FUSED_ITERATIONS = 4
@@ -76,6 +78,7 @@ class Program:
         remember: adds a push of every scene to the memory; donates the learning state.
         update: samples and updates once; donates the learning state.
         successes: reasons that count as success.
+        pace: where the schedules end, as far as the configuration says so.
         fused_iterations: how many iterations `compile` puts into one program, see `make_iterate`; 0 compiles the parts.
         iterate: that program.
         layout: which device holds what of all this.
@@ -86,6 +89,7 @@ class Program:
     remember: RememberFn
     update: UpdateFn
     successes: tuple[int, ...]
+    pace: Pace
     fused_iterations: int = 0
     iterate: IterateFn | None = None
     layout: Layout = field(default_factory=Layout)
@@ -115,20 +119,21 @@ class Program:
         """
         state = _shapes(state)
         of_state, copied = self._shardings, self.layout.copied
+        pace = _shapes(self.pace)
         if self.fused_iterations:
             due = (jax.ShapeDtypeStruct((self.fused_iterations,), dtype) for dtype in (jnp.int32, jnp.float32))
-            iterate = _compile(make_iterate(self), (state, *due), (of_state, copied, copied), of_state)
+            iterate = _compile(make_iterate(self), (state, *due, pace), (of_state, copied, copied, copied), of_state)
             return dataclasses.replace(self, iterate=iterate)
-        arguments = (state.actors, state.learning.learner.params)
+        arguments = (state.actors, state.learning.learner.params, pace)
         experience = jax.eval_shape(self.collect, *arguments)[1]
 
         def compile_collect(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-            return _compile(function, arguments, (of_state.actors, copied), (of_state.actors, copied))
+            return _compile(function, arguments, (of_state.actors, copied, copied), (of_state.actors, copied))
 
         parts = {
             "collect": cast(Stages, self.collect).compile(*arguments, compile_fn=compile_collect),
             "remember": _compile(self.remember, (state.learning, experience), (copied, copied), copied),
-            "update": _compile(self.update, (state.learning, np.float32(0)), (copied, copied), copied),
+            "update": _compile(self.update, (state.learning, np.float32(0), pace), (copied, copied, copied), copied),
         }
         return dataclasses.replace(self, **parts)
 
@@ -154,7 +159,7 @@ def make_program(
         ValueError: `params` do not fit the network.
     """
     q = q_function or make_q_function(config.network, config.task, env.primitive.actions)
-    optimizer = make_optimizer(config.learner)
+    pace = make_pace(config, known_length(config))
     stages = make_collect(env, q, config.exploration, warmup=config.learner.warmup, vmap=layout.vmap)
     # Under jit, so that shapes, start and compilation share one trace: that of a physics engine takes seconds.
     collect = dataclasses.replace(
@@ -167,14 +172,15 @@ def make_program(
         # XLA's own generator compiles four times faster than threefry, forty kernels long.
         fast_key = jax.random.wrap_key_data(jnp.tile(jax.random.key_data(network_key), 2), impl="rbg")
         drawn = q.init(fast_key)
-        experience: Experience = jax.eval_shape(collect, *_shapes((actors, drawn)))[1]
+        experience: Experience = jax.eval_shape(collect, *_shapes((actors, drawn, pace)))[1]
         learning = init_learning(
             learner_key,
             drawn if params is None else params,
             experience.steps,
             config.replay,
-            optimizer,
+            make_optimizer(config.learner),
             max_pushes=config.task.max_pushes,
+            num_siblings=1 + config.exploration.branches if config.learner.siblings else 1,
         )
         return TrainState(actors, learning)
 
@@ -182,7 +188,6 @@ def make_program(
         q=q,
         mask_fn=env.action_mask,
         successes=env.rules.successes,
-        optimizer=optimizer,
         config=config.learner,
         replay_config=config.replay,
         split_fn=layout.split_batch,
@@ -193,7 +198,7 @@ def make_program(
             f"{config.network.architecture} and network.width = {config.network.width}"
         )
     remember = make_remember(config.replay, env.rules)
-    return Program(init, collect, remember, update, env.rules.successes, _num_fused(config), layout=layout)
+    return Program(init, collect, remember, update, env.rules.successes, pace, _num_fused(config), layout=layout)
 
 
 def _num_fused(config: Config) -> int:
@@ -210,16 +215,17 @@ def make_iterate(program: Program) -> IterateFn:
     loop of XLA's CPU compiler an update takes several times as long. Counts are as in `Trainer`, which the host knows.
     """
 
-    def iteration(state: TrainState, due: tuple[jax.Array, jax.Array]) -> tuple[TrainState, None]:
+    def iteration(pace: Pace, state: TrainState, due: tuple[jax.Array, jax.Array]) -> tuple[TrainState, None]:
         updates, beta = due
-        actors, experience = program.collect(state.actors, state.learning.learner.params)
+        actors, experience = program.collect(state.actors, state.learning.learner.params, pace)
         learning = program.remember(state.learning, experience)
         updates = jnp.where(learning.replay.num_alive > 0, updates, 0)
-        learning = jax.lax.fori_loop(0, updates, lambda _, learning: program.update(learning, beta), learning)
+        learning = jax.lax.fori_loop(0, updates, lambda _, learning: program.update(learning, beta, pace), learning)
         return TrainState(actors, learning), None
 
-    def iterate(state: TrainState, updates: Any, beta: Any) -> TrainState:
-        return jax.lax.scan(iteration, state, (jnp.asarray(updates), jnp.asarray(beta)))[0]
+    def iterate(state: TrainState, updates: Any, beta: Any, pace: Pace) -> TrainState:
+        step = functools.partial(iteration, pace)
+        return jax.lax.scan(step, state, (jnp.asarray(updates), jnp.asarray(beta)))[0]
 
     return iterate
 

@@ -10,7 +10,7 @@ from typing import Any
 from pregrasp_jax.checkpoint import save, save_policy
 from pregrasp_jax.config import Config
 from pregrasp_jax.learning.q_function import Params
-from pregrasp_jax.training import collect, learn, processes
+from pregrasp_jax.training import collect, learn, processes, schedules
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.dump import DumpFn
 from pregrasp_jax.training.mishap import NONE
@@ -33,6 +33,7 @@ class Counters:
         seconds: by phase, over all sessions; compilation and start-up are not training time.
         best: success rate of the best policy so far.
         evaluated_at: env steps of the last evaluation.
+        length: env steps of the run that its schedules refer to, see `schedules`; None until it is settled.
     """
 
     env_steps: int = 0
@@ -40,6 +41,7 @@ class Counters:
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PHASES, 0.0))
     best: float | None = None
     evaluated_at: int | None = None
+    length: int | None = None
 
     @property
     def total_seconds(self) -> float:
@@ -57,8 +59,10 @@ class Counters:
 
     def share_done(self, config: Config) -> float:
         """Return how much of the run is done, 0 to 1, by the limit that comes first."""
-        by_time = self.total_seconds / (60 * config.train.minutes) if config.train.minutes else 0.0
-        return min(1.0, max(by_time, self.episodes / config.train.episodes))
+        train = config.train
+        by_time = self.total_seconds / (60 * train.minutes) if train.minutes else 0.0
+        by_steps = self.env_steps / train.env_steps if train.env_steps else 0.0
+        return min(1.0, max(by_time, by_steps, self.episodes / train.episodes))
 
     def seconds_left(self, config: Config) -> float | None:
         """Return the training time still to come, s; None while nothing is known of it."""
@@ -118,8 +122,12 @@ class Recorder:
         """
         counters = self.counters
         row = collect.metrics(state.actors.tally, self._successes) | learn.metrics(state.learning)
-        warmup = self.config.learner.warmup
-        epsilon = collect.epsilon_at(counters.env_steps, self.config.exploration, warmup=warmup)
+        epsilon = collect.epsilon_at(
+            counters.env_steps,
+            self.config.exploration,
+            warmup=self.config.learner.warmup,
+            decay=schedules.epsilon_decay(self.config, counters.length),
+        )
         steps, seconds = counters.env_steps - self._logged_at[0], counters.total_seconds - self._logged_at[1]
         row |= {"train/epsilon": float(epsilon), "time/seconds": counters.total_seconds}
         row |= {f"time/{phase}": counters.seconds[phase] for phase in PHASES}

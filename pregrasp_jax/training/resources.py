@@ -7,15 +7,13 @@ from typing import Any
 import jax
 
 from pregrasp_jax.checkpoint.state import KEEP
+from pregrasp_jax.machine import free_memory
 
 COMPRESSED = 0.25
 """Share of the observations' bytes that their chunks take on disk; 0.1 was measured on clutter."""
 
 WORKING_MEMORY = 1e9
 """Bytes for compiled programs, the scene bank and a chunk on its way to disk (1.1e9 measured, with libraries)."""
-
-_MEMINFO = Path("/proc/meminfo")
-_CGROUP = Path("/sys/fs/cgroup")
 
 
 def num_bytes(tree: Any) -> int:
@@ -32,8 +30,7 @@ def available_memory() -> int | None:
     stats = jax.local_devices()[0].memory_stats() or {}
     if "bytes_limit" in stats:
         return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
-    known = [free for free in (_free_of_machine(), _free_of_control_group()) if free is not None]
-    return min(known, default=None)
+    return free_memory()
 
 
 def available_disk(path: Path) -> int:
@@ -82,24 +79,3 @@ def _held_by_checkpoints(run_dir: Path) -> int:
     """Return the bytes of a run's checkpoints, without those that were damaged and have been set aside."""
     files = (path for path in (run_dir / "checkpoints").rglob("*") if path.is_file())
     return sum(path.stat().st_size for path in files if path.parent.suffix != ".damaged")
-
-
-def _free_of_machine() -> int | None:
-    if not _MEMINFO.exists():
-        return None
-    fields = dict(line.split(":", 1) for line in _MEMINFO.read_text().splitlines() if ":" in line)
-    return int(fields["MemAvailable"].split()[0]) * 1024 if "MemAvailable" in fields else None
-
-
-def _free_of_control_group() -> int | None:
-    limit, used = _CGROUP / "memory.max", _CGROUP / "memory.current"
-    if not limit.exists() or not used.exists() or not limit.read_text().strip().isdigit():
-        return None
-    return int(limit.read_text()) - int(used.read_text()) + _inactive_file_cache()
-
-
-def _inactive_file_cache() -> int:
-    """Return the bytes that count as used by the control group, but are given back when they are in the way."""
-    stat = _CGROUP / "memory.stat"
-    rows = (line.split() for line in stat.read_text().splitlines()) if stat.exists() else ()
-    return next((int(row[1]) for row in rows if row[0] == "inactive_file"), 0)

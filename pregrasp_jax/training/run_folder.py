@@ -5,7 +5,6 @@ physics diverged), run.lock.
 """
 
 import datetime
-import errno
 import fcntl
 import json
 import os
@@ -124,7 +123,7 @@ class RunFolder:
         """Record configuration, versions, machine and hashes; call it before anything else is written.
 
         Raises:
-            ValueError: the run began with other objects or scenes, or its manifest is damaged.
+            ValueError: the run began with other objects or scenes or in another place, or its manifest is damaged.
         """
         manifest = read_manifest(self.path) or {"hashes": hashes, "sessions": []}
         then = manifest["hashes"]
@@ -132,7 +131,7 @@ class RunFolder:
             if then.get(name) != hashes.get(name):
                 raise ValueError(
                     f"run {self.path} began with another {name} ({then.get(name)}, now {hashes.get(name)}); resume it "
-                    "with the same objects, MuJoCo and package version; --init-from starts a new run from its "
+                    "with the same objects, place, MuJoCo and package version; --init-from starts a new run from its "
                     "parameters"
                 )
         if difference(stored_config(self.path), config):
@@ -155,12 +154,7 @@ class RunFolder:
         Raises:
             OSError: the disk is full.
         """
-        data = (json.dumps(row, allow_nan=False) + "\n").encode()
-        with self.metrics.open("ab", buffering=0) as file:
-            length = file.tell()
-            if file.write(data) < len(data):  # what a full disk does at first; only the next write raises
-                file.truncate(length)
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), file.name)
+        io.append_json_line(self.metrics, row)
         if self._event_log:
             self._event_log.append(row)
 

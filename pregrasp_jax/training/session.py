@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ from pregrasp_jax import io
 from pregrasp_jax.checkpoint.policy import load_policy
 from pregrasp_jax.config import Config, to_dict, with_absolute_paths
 from pregrasp_jax.evaluation import Evaluator
+from pregrasp_jax.evaluation.clearing import own_protocol
 from pregrasp_jax.learning.q_function import Params, make_q_function
 from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import Env, make_env
-from pregrasp_jax.training import processes, resources, trainer
+from pregrasp_jax.training import imitation, processes, resources, trainer
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.dump import DumpFn, make_dump
 from pregrasp_jax.training.event_log import require_module
@@ -70,13 +72,22 @@ def resume(config: Config, run_dir: Path, *, console: Console | None = None) -> 
 
 
 def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
-    config.validate()
+    return METHODS[config.train.method](config.validate(), run_dir, folder, params, console)
+
+
+def _learn_q(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
     if config.train.tensorboard:
         require_module()
     layout = make_layout(config)
     if jax.device_count() > 1:
         console.say(f"training on {layout.num_devices} of {jax.device_count()} devices")
     env = _load(config, "train", console)
+    refuse_mirror(config, env)
+    if not env.rules.asks_for_grasp:
+        raise ValueError(
+            f"train.method = q_learning learns where to push before a grasp, but task.primitive = "
+            f"{config.task.primitive!r} grasps by itself; allowed with it: imitation"
+        )
     validation = _load(config, "validation", console)
     program = make_program(env, config, params=params, layout=layout)
     resources.check(*program.shapes().split(), run_dir)
@@ -103,6 +114,26 @@ def _session(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
             console.close()
         console.say(ending)
         return interrupt.exit_code or (0 if session.recorder.saved else 1)
+
+
+def refuse_mirror(config: Config, env: Env) -> None:
+    """Refuse to learn from mirror images that are no scenes of the task.
+
+    Raises:
+        ValueError: one line says what breaks the symmetry.
+    """
+    if not config.network.mirror or env.symmetric:
+        return
+    why = (
+        f"robot {env.robot.name} starts in one posture between its walls (task.mirrored_start = "
+        f"{env.task.mirrored_start})"
+        if env.workspace.symmetric
+        else "it is not its own mirror image"
+    )
+    raise ValueError(
+        f"network.mirror = True in workspace '{env.workspace.name}': {why}; allowed is False, also with --init-from, "
+        "whose parameters fit either"
+    )
 
 
 def make_trainer(
@@ -146,6 +177,29 @@ def make_evaluate(env: Env, config: Config) -> tuple[EvaluateFn, CompileFn]:
     return evaluate, compile_evaluation
 
 
+def _imitate(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
+    if params is not None:
+        raise ValueError("--init-from is not known to train.method = imitation; allowed is to leave it out")
+    resumed = folder is not None
+    env = own_protocol(_load(config, "train", console))
+    folder = folder or _create(run_dir, config)
+    hashes = {"hull bank": env.bank.content_hash, "training scenes": env.scenes.content_hash}
+    with folder, Interrupt(console.say, console.close) as interrupt:
+        folder.begin_session(config, hashes)
+        try:
+            ending = imitation.run(
+                config, env, folder, console, resumed=resumed, stop=lambda: interrupt.exit_code is not None
+            )
+        finally:
+            console.close()
+        console.say(ending)
+        return interrupt.exit_code or 0
+
+
+METHODS = {"q_learning": _learn_q, "imitation": _imitate}
+"""Sessions by the name that `train.method` knows them by."""
+
+
 def _console() -> Console:
     """Return a console that is heard in process 0 only."""
     return Console(None if processes.is_first() else Path(os.devnull).open("w"))
@@ -156,11 +210,15 @@ def _create(run_dir: Path, config: Config) -> RunFolder:
 
 
 def _load(config: Config, split: Any, console: Console) -> Env:
-    def packed(done: int, total: int) -> None:
-        if done == total or done % max(1, total // 10) == 0:
-            console.say(f"packing {split} scenes: {done} of {total}")
+    def tell(doing: str) -> Callable[[int, int], None]:
+        def told(done: int, total: int) -> None:
+            if done == total or done % max(1, total // 10) == 0:
+                console.say(f"{doing}: {done} of {total}")
 
-    return make_env(config, split=split, progress=packed)
+        return told
+
+    packing, making = tell(f"packing {split} scenes"), tell(f"making objects for {split}")
+    return make_env(config, split=split, progress=packing, making=making)
 
 
 def _digest(config: Config, hashes: dict[str, str]) -> str:
@@ -174,4 +232,5 @@ def _hashes(env: Env, validation: Env) -> dict[str, str]:
         "hull bank": env.bank.content_hash,
         "training scenes": env.scenes.content_hash,
         "validation scenes": validation.scenes.content_hash,
+        "workspace": env.workspace.content_hash,
     }

@@ -12,7 +12,7 @@ from pregrasp_jax.learning.q_function import Params
 from pregrasp_jax.learning.replay import forget
 from pregrasp_jax.machine import announced_compilation
 from pregrasp_jax.policies.exploration import linear_schedule
-from pregrasp_jax.training import learn, processes
+from pregrasp_jax.training import learn, processes, schedules
 from pregrasp_jax.training.console import Console, format_time
 from pregrasp_jax.training.program import IterateFn, Program, TrainState
 from pregrasp_jax.training.recorder import Counters, Recorder
@@ -44,6 +44,8 @@ class Trainer:
         self.program, self.recorder, self.state = program, recorder, state
         self.config = recorder.config
         self.compile_evaluation = compile_evaluation
+        self._clock: tuple[int, float] | None = None
+        self._settle(schedules.known_length(self.config))
 
     def run(self, stop: Callable[[], bool]) -> str:
         """Train until a limit is reached or `stop`, asked before every step, returns True.
@@ -53,7 +55,7 @@ class Trainer:
         """
         recorder, counters, train = self.recorder, self.recorder.counters, self.config.train
         if counters.share_done(self.config) >= 1.0 and counters.evaluated_at == counters.env_steps:
-            return "the run is complete; a higher --train.episodes or --train.minutes extends it"
+            return "the run is complete; a higher --train.episodes, --train.env-steps or --train.minutes extends it"
         start = time.perf_counter()
         with announced_compilation(recorder.console.say):
             program = self.program.compile(self.state)
@@ -64,6 +66,7 @@ class Trainer:
             if processes.agreed(stop()):
                 return self._interrupted()
             self.step(program)
+            self._measure_length()
             if self._crossed(train.log_every):
                 self.state = recorder.log(self.state)
             if self._crossed(train.evaluate_every):
@@ -97,19 +100,19 @@ class Trainer:
         """Run one program of several iterations; all its time counts as collecting."""
         counters = self.recorder.counters
         with counters.timed("collect"):
-            self.state = iterate(self.state, updates.astype(np.int32), np.array(betas, np.float32))
+            self.state = iterate(self.state, updates.astype(np.int32), np.array(betas, np.float32), self.pace)
             counters.episodes = int(self.state.actors.tally.episodes)
 
     def _push_and_learn(self, program: Program, updates: int, beta: float) -> None:
         """Push once in every scene and learn from it."""
         counters, state = self.recorder.counters, self.state
         with counters.timed("collect"):
-            actors, experience = program.collect(state.actors, state.learning.learner.params)
+            actors, experience = program.collect(state.actors, state.learning.learner.params, self.pace)
             counters.episodes = int(experience.episodes)
         with counters.timed("learn"):
             learning = program.remember(state.learning, experience)
             for _ in range(updates if updates and learning.replay.num_alive else 0):
-                learning = program.update(learning, np.float32(beta))
+                learning = program.update(learning, np.float32(beta), self.pace)
             jax.block_until_ready(learning.updates)
         self.state = TrainState(actors, learning)
 
@@ -125,10 +128,33 @@ class Trainer:
 
     def _beta(self, env_steps: int) -> float:
         """Return the importance exponent."""
-        replay = self.config.replay
-        return float(
-            linear_schedule(env_steps, start=replay.importance_exponent, end=1.0, steps=replay.importance_steps)
-        )
+        steps = schedules.importance_steps(self.config, self.recorder.counters.length)
+        start = self.config.replay.importance_exponent
+        return float(linear_schedule(env_steps, start=start, end=1.0, steps=steps))
+
+    def _settle(self, length: int | None) -> None:
+        """Take the length of the run, in env steps, unless it was settled before."""
+        counters = self.recorder.counters
+        counters.length = length if counters.length is None else counters.length
+        self.pace = schedules.make_pace(self.config, counters.length)
+
+    def _measure_length(self) -> None:
+        """Settle the length of a run that a clock ends, by its speed after the warm-up."""
+        counters, num_envs = self.recorder.counters, self.config.train.num_envs
+        if counters.length is not None or counters.env_steps < self.config.learner.warmup:
+            return
+        now = counters.env_steps, counters.total_seconds
+        self._clock = self._clock or now
+        steps, seconds = now[0] - self._clock[0], now[1] - self._clock[1]
+        if steps < schedules.MEASURED_STEPS * num_envs:
+            return
+        speed = steps / max(seconds, 1e-9)
+        length = schedules.measured_length(self.config, env_steps=now[0], seconds=now[1], steps_per_second=speed)
+        self._settle(processes.agreed_number(length))
+        if schedules.depends_on_length(self.config):
+            self.recorder.console.say(
+                f"{speed:.1f} steps per second: schedules are those of a run of {counters.length} steps"
+            )
 
     def _crossed(self, interval: int) -> bool:
         """Return whether the last step reached a multiple of `interval` env steps (0: never)."""

@@ -56,7 +56,7 @@ def test_the_scene_ends_and_its_neighbours_do_not_notice(trainer):
     params = trainer.state.learning.learner.params
 
     def collect(actors: Actors) -> Any:
-        return program.collect(jax.tree.map(jnp.copy, actors), params)  # which donates its actors
+        return program.collect(jax.tree.map(jnp.copy, actors), params, program.pace)  # which donates its actors
 
     healthy, steps = collect(trainer.state.actors)
     sick, sick_steps = collect(poison(trainer.state.actors))

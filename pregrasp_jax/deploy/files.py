@@ -1,0 +1,115 @@
+"""Images and masks that other programs write: a camera driver, a network. Each file is read anew at every look."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pregrasp_jax.deploy.devices import DeviceError, Frame
+from pregrasp_jax.deploy.masks import Masks, from_mask_rcnn
+
+
+class FileSource:
+    """A depth camera whose driver keeps writing one file, whole (to another name, then renamed)."""
+
+    def __init__(self, depth: Path, color: Path | None = None, *, patience_s: float = 5.0):
+        """Remember the files; they are read by `capture`.
+
+        Args:
+            depth: .npy, or .png of 16 bits.
+            color: .png; None without one.
+            patience_s: how long a newer image than the last one is waited for.
+        """
+        self._depth, self._color, self._patience, self._last = depth, color, patience_s, 0.0
+
+    def capture(self) -> tuple[np.ndarray, np.ndarray | None, float]:
+        """Return the newest image; see `ImageSource.capture`."""
+        begun = time.monotonic()
+        while not (self._depth.is_file() and self._depth.stat().st_mtime > self._last):
+            if time.monotonic() - begun > self._patience:
+                raise DeviceError(
+                    f"no new depth image in {self._depth} for {self._patience:g} s; is its writer running?"
+                )
+            time.sleep(0.02)
+        self._last = self._depth.stat().st_mtime
+        color = read_image(self._color) if self._color else None
+        return read_depth(self._depth), color, self._last
+
+
+class FileSegmenter:
+    """Masks that a network writes beside the depth image."""
+
+    def __init__(self, path: Path, *, min_score: float):
+        self._path, self._min_score = path, min_score
+
+    def segment(self, frame: Frame) -> Masks:
+        """Return what the file holds; see `Segmenter.segment`."""
+        del frame
+        return read_masks(self._path, min_score=self._min_score)
+
+
+def read_depth(path: Path) -> np.ndarray:
+    """Return a depth image as it was written.
+
+    Raises:
+        ValueError: it cannot be read, or is of a kind that holds no depth.
+    """
+    if path.suffix == ".npy":
+        return _load(path)
+    image = read_image(path)
+    if image.ndim != 2 or image.dtype == np.uint8:
+        raise ValueError(
+            f"{path} is a picture of {image.dtype}{list(image.shape)}; allowed is a 16-bit grey .png, or .npy"
+        )
+    return image.astype(np.uint16) if image.dtype.kind == "i" and image.min() >= 0 else image
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Return the pixels of a picture.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
+    try:
+        with Image.open(path) as image:
+            return np.array(image)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} cannot be read as a picture ({' '.join(str(error).split())})") from None
+
+
+def read_masks(path: Path, *, min_score: float = 0.5) -> Masks:
+    """Return the masks of a file: .npz of masks, labels, scores (and names), or .png of instance ids.
+
+    Raises:
+        ValueError: it cannot be read, or holds something else.
+    """
+    if path.suffix == ".npz":
+        held = _load(path)
+        names = {int(k): str(v) for k, v in json.loads(str(held["names"])).items()} if "names" in held else None
+        return from_mask_rcnn({key: held[key] for key in held if key != "names"}, names, min_score=min_score)
+    ids = read_image(path)
+    if ids.ndim != 2:
+        raise ValueError(f"{path} has shape {list(ids.shape)}; allowed is a grey .png of instance ids, 0 for the table")
+    return masks_of_ids(ids)
+
+
+def masks_of_ids(ids: np.ndarray) -> Masks:
+    """Return the masks of an image of instance ids, which are their names; 0 is the table."""
+    found = [int(value) for value in np.unique(ids) if value]
+    masks = np.stack([ids == value for value in found]) if found else np.zeros((0, *ids.shape), bool)
+    return Masks(masks, tuple(map(str, found)), np.ones(len(found)))
+
+
+def _load(path: Path) -> Any:
+    """Return an array, or the arrays of an npz by name. Nothing is unpickled."""
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return loaded
+        with loaded:
+            return {name: loaded[name] for name in loaded.files}
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(f"{path} cannot be read ({' '.join(str(error).split())})") from None

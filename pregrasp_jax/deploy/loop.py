@@ -1,0 +1,177 @@
+"""Look, decide, push, look again; close when the target is enclosed."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from pregrasp_jax.deploy.camera import PinholeCamera, depth_in_metres
+from pregrasp_jax.deploy.decision import Decider, Decision
+from pregrasp_jax.deploy.devices import ArmDriver, Frame, GripperDriver, ImageSource, Segmenter
+from pregrasp_jax.deploy.log import DecisionLog
+from pregrasp_jax.deploy.masks import Target, fuse
+from pregrasp_jax.deploy.projection import Crop, Maps, draw_robot, to_maps
+from pregrasp_jax.spaces import motion
+
+LIFT_HEIGHT = 0.2
+"""m, after the fingers have closed."""
+
+
+class Looked(NamedTuple):
+    """One look, and what was decided.
+
+    Attributes:
+        frame: what was taken.
+        labels: [rows, columns] uint8.
+        maps: what the policy read.
+        decision: what to do.
+        times_ms: what took how long, by name.
+    """
+
+    frame: Frame
+    labels: np.ndarray
+    maps: Maps
+    decision: Decision
+    times_ms: dict[str, float]
+
+
+class Result(NamedTuple):
+    """How a trial ended.
+
+    Attributes:
+        reason: `grasped`, `not_held`, `no_push`, `max_pushes`, or `once`.
+        pushes: that were made.
+    """
+
+    reason: str
+    pushes: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Station:
+    """A policy with its devices.
+
+    Attributes:
+        decider: the policy.
+        camera: as calibrated.
+        crop: of its image.
+        source: of images.
+        segmenter: of their objects.
+        target: which of them is wanted.
+        arm: that pushes.
+        gripper: that is held open or closed meanwhile.
+        depth_scale: m per step of an image; None as in `depth_in_metres`.
+        cell: which of the points above a cell counts.
+        log: None writes nothing.
+        say: told what happens.
+    """
+
+    decider: Decider
+    camera: PinholeCamera
+    crop: Crop
+    source: ImageSource
+    segmenter: Segmenter
+    target: Target
+    arm: ArmDriver
+    gripper: GripperDriver
+    depth_scale: float | None = None
+    cell: str = "max"
+    log: DecisionLog | None = None
+    say: Callable[[str], None] = print
+
+    def run(self, *, once: bool = False) -> Result:
+        """Run a trial: at most as many pushes as the contract says, or one.
+
+        Raises:
+            DeviceError: a device cannot go on; nothing is retried.
+            ValueError: an image, a mask or a joint cannot be used.
+        """
+        entry = self.decider.contract.action
+        hand, pushes = self.decider.start(), 0
+        while True:
+            looked = self.look(hand)
+            self._write(pushes, looked, hand)
+            decision = looked.decision
+            if decision.close:
+                self.say(f"the target is enclosed ({decision.coverage:.0%}): closing")
+                held = self.gripper.grasp()
+                self.arm.lift(LIFT_HEIGHT)
+                return self._end("grasped" if held else "not_held", pushes)
+            if decision.push is None:
+                return self._end("no_push", pushes)
+            if pushes >= entry.max_pushes:
+                return self._end("max_pushes", pushes)
+            push, choice = decision.push, entry.choices[decision.push.choice]
+            x, y, z = push.poses[-1, :3]
+            self.say(
+                f"push {pushes + 1}: hand {choice.name} to ({x:.4f}, {y:.4f}, {z:.3f}) m, value {push.value:.2f}, "
+                f"decided in {sum(looked.times_ms.values()):.0f} ms"
+            )
+            self.gripper.move(choice.opening)
+            self.arm.push(push)
+            hand, pushes = push.end, pushes + 1
+            if once:
+                return self._end("once", pushes)
+
+    def look(self, hand: motion.Held) -> Looked:
+        """Take an image and decide; `hand` is where the last push was commanded to end."""
+        frame = self._capture()
+        clock = _Clock()
+        masks = self.segmenter.segment(frame)
+        target = self.target.find(masks)
+        clock.lap("segmentation")
+        entry = self.decider.contract.grid
+        labels = fuse(masks, target, entry.labels, self.camera.shape)
+        metres = depth_in_metres(frame.depth, scale=self.depth_scale, shape=self.camera.shape)
+        depth, cut = (image[self.crop.rows, self.crop.columns].copy() for image in (metres, labels))
+        clock.lap("reading")
+        geometry = {"camera": self.camera, "crop": self.crop}
+        joints, robot = frame.joint_pos, entry.labels["robot"]
+        draw_robot(depth, cut, **geometry, body=self.decider.body, joint_pos=joints, label=robot)
+        clock.lap("drawing")
+        maps = to_maps(depth, cut, **geometry, cell=self.cell)
+        clock.lap("projection")
+        decision = self.decider.decide(maps, hand, joints, lap=clock.lap)
+        clock.lap("decoding")
+        return Looked(frame, labels, maps, decision, clock.times_ms)
+
+    def _capture(self) -> Frame:
+        depth, color, taken = self.source.capture()
+        entry = self.decider.contract.action
+        apertures = [choice.aperture_rad for choice in entry.choices]
+        fingers = min(apertures) + self.gripper.opening() * (max(apertures) - min(apertures))
+        return Frame(depth, color, np.concatenate([self.arm.joints(), [fingers, fingers]]), taken)
+
+    def _write(self, number: int, looked: Looked, hand: motion.Held) -> None:
+        if self.log is not None:
+            self.log.write(
+                number,
+                frame=looked.frame,
+                labels=looked.labels,
+                maps=looked.maps,
+                hand=hand,
+                decision=looked.decision,
+                times_ms=looked.times_ms,
+            )
+
+    def _end(self, reason: str, pushes: int) -> Result:
+        if self.log is not None:
+            self.log.conclude({"reason": reason, "pushes": pushes})
+        self.say(f"{reason.replace('_', ' ')} after {pushes} pushes")
+        return Result(reason, pushes)
+
+
+class _Clock:
+    """Says how long the parts of a decision took."""
+
+    def __init__(self):
+        self.times_ms: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        """End a part."""
+        now = time.perf_counter()
+        self.times_ms[name] = 1e3 * (now - self._last)
+        self._last = now

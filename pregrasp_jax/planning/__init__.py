@@ -1,0 +1,1 @@
+"""A search that decides, in a scene rebuilt from what the camera sees."""

@@ -1,0 +1,129 @@
+"""A policy that simulates before it pushes, in a scene rebuilt from what the camera sees."""
+
+import functools
+import math
+import time
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from pregrasp_jax.config import PlanningConfig, to_dict
+from pregrasp_jax.heightmap import overhead_camera, robot_hulls
+from pregrasp_jax.learning.q_function import QFunction
+from pregrasp_jax.planning import memory as remembering
+from pregrasp_jax.planning import simulation
+from pregrasp_jax.planning.memory import Memory, Sight
+from pregrasp_jax.planning.rebuild import draw_variants, hidden_cells
+from pregrasp_jax.planning.rollout import Rollout
+from pregrasp_jax.planning.search import search
+from pregrasp_jax.task.env import Env
+from pregrasp_jax.types import MAX_OBJECTS, EnvState, HullBank
+
+BATCH = 8
+"""Pushes simulated at a time: what pads a batch is drawn and valued for nothing."""
+
+_TRIED = 16
+"""Candidates with those of scripts."""
+
+_APART = 4
+"""Cells, 2 cm, between two pushes of one choice that the network proposes."""
+
+
+class Planned(NamedTuple):
+    """A decision.
+
+    Attributes:
+        action: flat index of Q.
+        memory: for the next decision of the episode.
+    """
+
+    action: int
+    memory: Memory
+
+
+class Planner:
+    """Decides for one scene at a time; from one decision to the next it keeps compiled programs and what they took."""
+
+    def __init__(self, env: Env, q_function: QFunction, params: Any, config: PlanningConfig, *, threads: int = 0):
+        """Compile the model of rebuilt objects.
+
+        Args:
+            env: of the task; its objects and scenes are not looked at.
+            q_function: of the policy that proposes and continues.
+            params: of the policy.
+            config: how much is searched.
+            threads: of the simulations; 0 takes every core, and decisions do not depend on it.
+        """
+        self._config, self._robot = config, env.robot
+        self._simulations = simulation.make_simulations(
+            env.robot, env.workspace, num_variants=config.variants, threads=threads
+        )
+        self._rollout = Rollout(env, self._simulations, q_function, params, batch=BATCH)
+        self._place_robot = jax.jit(functools.partial(robot_hulls, env.robot))
+        self._camera = None if env.task.camera == "orthographic" else np.asarray(overhead_camera().position)
+        self._seconds: list[float] = []
+        self._pushes: list[int] = []
+
+    def decide(self, sight: Sight, memory: Memory, key: jax.Array) -> Planned:
+        """Return the push that does best in simulation.
+
+        Args:
+            sight: what the policy may read now.
+            memory: of the episode's earlier decisions, `memory.NOTHING` at its begin.
+            key: for scripted pushes and variants.
+        """
+        begin = time.perf_counter()
+        hidden = hidden_cells(sight.obs, self._camera)
+        memory = remembering.look(sight, memory, hidden=hidden, camera=self._camera)
+        values = self._rollout.values(sight.obs, sight.target)
+        proposed = spread_best(values, self._config.candidates)
+        if memory[sight.target] is None or len(proposed) < 2:  # nothing to search for, or among
+            return Planned(proposed[0] if proposed else 0, memory)
+        script_key, variant_key = jax.random.split(key)
+        bank, roots = self._rebuild(sight, memory, variant_key)
+        scripted = self._rollout.propose(roots, script_key)[: max(_TRIED - len(proposed), 0)]
+        candidates = list(dict.fromkeys([*proposed, *scripted]))
+        limit = self._config.budget_ms / 1e3 if self._config.budget_ms else math.inf
+        found = search(self._rollout, bank, roots, candidates, self._config, begin + limit)
+        self._seconds.append(time.perf_counter() - begin)
+        self._pushes.append(found.pushes)
+        return Planned(found.action, memory)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the settings of the search, and what decisions took until now (the median; the first one compiles)."""
+        taken = {"seconds": self._seconds, "pushes": self._pushes}
+        per_decision = {name: round(float(np.median(values or [0.0])), 3) for name, values in taken.items()}
+        return {"settings": to_dict(self._config), "per_decision": per_decision}
+
+    def _robot_at(self, sight: Sight) -> np.ndarray:
+        return np.asarray(self._place_robot(sight.joint_pos).vertices)
+
+    def _rebuild(self, sight: Sight, memory: Memory, key: jax.Array) -> tuple[HullBank, EnvState]:
+        """Write the variants of the rebuilt scene into the simulations; return their objects and their states [V]."""
+        seed = np.asarray(jax.random.key_data(key)).tolist()
+        variants = draw_variants(memory, self._robot_at(sight), self._config.variants, np.random.default_rng(seed))
+        self._simulations.write(variants.bank)
+        ids = np.arange(self._config.variants * MAX_OBJECTS).reshape(-1, MAX_OBJECTS)
+        object_ids = np.where(variants.known, ids, -1).astype(np.int32)
+        qpos = self._simulations.place(variants.poses, sight.joint_pos)
+        return variants.bank, self._rollout.start(
+            variants.bank, object_ids, variants.poses, qpos, sight.obs.hand, sight.target
+        )
+
+
+def spread_best(values: np.ndarray, count: int) -> list[int]:
+    """Return the flat indices of the best `count` of values [H, W, K]; those of one choice are `_APART` cells apart.
+
+    Args:
+        values: -inf where a push is not allowed.
+        count: fewer are returned where no more are allowed.
+    """
+    values, found = values.copy(), []
+    while len(found) < count and np.isfinite(values.max()):
+        index = int(np.argmax(values))
+        row, col, choice = np.unravel_index(index, values.shape)
+        near = tuple(slice(max(int(i) - _APART + 1, 0), int(i) + _APART) for i in (row, col))
+        values[(*near, choice)] = -np.inf
+        found.append(index)
+    return found

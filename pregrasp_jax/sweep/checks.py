@@ -1,0 +1,190 @@
+"""Everything that can be known to be wrong before the first trial starts, one line each."""
+
+import itertools
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from pregrasp_jax.config import EvaluationConfig, from_dict, to_dict
+from pregrasp_jax.spaces.workspace import WORKSPACES, get_workspace
+from pregrasp_jax.sweep import parameters
+from pregrasp_jax.sweep.spec import PROGRAM, Spec
+from pregrasp_jax.sweep.trials import trial_config
+
+GIVEN = {"seed": "seeds", "physics.threads": "resources.cores"}
+"""Settings that other keys of a sweep decide."""
+
+LIMITS = ("train.env_steps", "train.episodes", "train.minutes")
+
+Setting = tuple[Mapping[str, Any], Mapping[str, Any]]
+"""What varies, and what else `trials.make_trial` must know."""
+
+
+def settings_of(spec: Spec) -> list[Setting] | None:
+    """Return the settings of a sweep in order; None if they are found on the way."""
+    if spec.variants:
+        return [
+            (variant.settings, {"name": name, "policy": variant.policy, "init_from": variant.init_from})
+            for name, variant in spec.variants.items()
+        ]
+    if spec.search.method == "grid":
+        return [(setting, {}) for setting in parameters.grid(spec.parameters, spec.search.seed)]
+    if spec.search.method == "tpe":
+        return None
+    return [(setting, {}) for setting in _different(spec)]
+
+
+def check(spec: Spec) -> None:
+    """Refuse a sweep that cannot run as it is meant.
+
+    Raises:
+        ValueError: one line says what, where, and what is allowed.
+    """
+    for problem in itertools.chain(_search(spec), _names(spec), _stop(spec), _resources(spec), _final(spec)):
+        raise ValueError(problem)
+    for varied, about in settings_to_check(spec):
+        if about.get("policy") is None:
+            _check_setting(spec, varied)
+    for name, options in spec.tests.items():
+        _check_test(spec, name, options)
+
+
+def settings_to_check(spec: Spec) -> list[Setting]:
+    """Return settings such that all of the sweep are allowed if these are."""
+    known = settings_of(spec)
+    if known is not None:
+        return known
+    middle = {name: parameter.given[0] for name, parameter in spec.parameters.items()}
+    corners = ((name, value) for name, parameter in spec.parameters.items() for value in parameter.corners())
+    return [(middle | {name: value}, {}) for name, value in corners]
+
+
+def num_settings(spec: Spec) -> int:
+    """Return how many settings there will be."""
+    known = settings_of(spec)
+    return len(known) if known is not None else spec.search.trials or 0
+
+
+def _search(spec: Spec) -> Iterator[str]:
+    search = spec.search
+    if not spec.seeds:
+        yield "seeds is empty; allowed is a list such as [0, 1]"
+    if spec.variants and (spec.parameters or search.method != "grid"):
+        yield "variants are not searched; allowed is either variants, or parameters and search"
+    if search.method == "grid" and search.trials is not None:
+        yield "search.trials: a grid tries all combinations; allowed is to leave it out, or random or tpe"
+    ranges = [name for name, parameter in spec.parameters.items() if parameter.kind != "values"]
+    if search.method == "grid" and ranges:
+        yield f"parameters.{ranges[0]} is a range, which a grid cannot try; allowed: values, or method random or tpe"
+    if search.method != "grid" and (not spec.parameters or (search.trials or 0) < 1):
+        yield f"search.method {search.method} needs parameters, and search.trials of 1 and more"
+    if search.method == "random" and spec.parameters and len(_different(spec)) < (search.trials or 0):
+        yield f"search.trials = {search.trials}, but there are only {len(_different(spec))} settings to draw"
+
+
+def _names(spec: Spec) -> Iterator[str]:
+    if doubled := sorted(set(spec.set) & set(spec.parameters)):
+        yield f"{doubled[0]} stands in set and in parameters; allowed is one of them"
+    varied = (variant.settings for variant in spec.variants.values())
+    for name in itertools.chain(spec.set, spec.parameters, *varied):
+        if name in GIVEN:
+            yield f"{name} is decided by {GIVEN[name]}; allowed is that"
+    for name, variant in spec.variants.items():
+        if variant.policy is not None and (variant.settings or variant.init_from):
+            yield f"variants.{name} names a policy, which is not trained; allowed beside it is nothing"
+        start = variant.init_from
+        if start is not None and start != "pretrained" and not Path(start).exists():
+            yield f"variants.{name}.init_from = {start!r} does not exist; allowed: pretrained, a run or a policy folder"
+
+
+def _stop(spec: Spec) -> Iterator[str]:
+    stop = spec.stop
+    if not stop.metric.startswith("eval/"):
+        yield f"stop.metric = {stop.metric!r} is not of validation scenes; allowed: eval/success_rate and others"
+    if stop.method == "none":
+        if stop.rungs:
+            yield "stop.rungs belong to stop.method halving"
+        return
+    if not stop.rungs or list(stop.rungs) != sorted(stop.rungs) or stop.rungs[0] < 1:
+        yield f"stop.rungs = {list(stop.rungs)} must be env steps above 0 in ascending order, one and more"
+    if not 0 < stop.keep < 1:
+        yield f"stop.keep = {stop.keep} is out of range; allowed is between 0 and 1"
+    if spec.search.method == "tpe":
+        yield "stop.method halving compares settings that are known at the start; allowed with search.method tpe: none"
+    if num_settings(spec) < 2:
+        yield "stop.method halving needs two settings and more"
+    varied = {
+        name for settings in [spec.parameters, *(v.settings for v in spec.variants.values())] for name in settings
+    }
+    if limits := [name for name in LIMITS if name in varied]:
+        yield f"{limits[0]} may change when a run goes on, so halving cannot compare it; allowed is one value in set"
+
+
+def _resources(spec: Spec) -> Iterator[str]:
+    resources = spec.resources
+    if resources.cores < 1:
+        yield f"resources.cores = {resources.cores} is out of range; allowed is 1 and more"
+    if resources.memory_gb is not None and resources.memory_gb <= 0:
+        yield f"resources.memory_gb = {resources.memory_gb} is out of range; allowed is above 0, or null"
+    if resources.gpu < 0 or (resources.gpu > 1 and not resources.gpu.is_integer()):
+        yield f"resources.gpu = {resources.gpu} is out of range; allowed is a share up to 1, or a whole number"
+
+
+def _final(spec: Spec) -> Iterator[str]:
+    final = spec.final
+    if used := sorted(set(final.seeds) & set(spec.seeds)):
+        yield f"final.seeds has {used[0]}, with which settings were chosen; allowed are others than {list(spec.seeds)}"
+    for name in ("top", "episodes"):
+        if getattr(final, name) < 1:
+            yield f"final.{name} = {getattr(final, name)} is out of range; allowed is 1 and more"
+
+
+def _check_setting(spec: Spec, varied: Mapping[str, Any]) -> None:
+    config = trial_config(spec, {**spec.set, **varied})
+    if spec.program == PROGRAM:  # another program may bring places of its own
+        get_workspace(config.task.workspace)
+    if spec.stop.method == "none":
+        return
+    every, rungs = config.train.evaluate_every, spec.stop.rungs
+    if not every or any(rung % every for rung in rungs):
+        raise ValueError(
+            f"stop.rungs = {list(rungs)} look at evaluations; allowed are multiples of train.evaluate_every = {every}"
+        )
+    if config.train.env_steps <= rungs[-1]:
+        raise ValueError(
+            f"stop.rungs end at {rungs[-1]}; halving needs train.env_steps above that, the length of a whole run, so "
+            f"that schedules are those of a whole run; it is {config.train.env_steps}"
+        )
+
+
+def _check_test(spec: Spec, name: str, options: Mapping[str, Any]) -> None:
+    """Refuse options that `evaluate` does not have, and places that are not there."""
+    values = to_dict(EvaluationConfig(policy=""))
+    for key, value in options.items():
+        if key in ("policy", "physics.threads"):
+            raise ValueError(f"tests.{name}.{key} is decided by the trial")
+        *stages, last = key.split(".")
+        section: Any = values
+        for stage in stages:
+            section = section.get(stage, {}) if isinstance(section, dict) else {}
+        if last not in section:
+            raise ValueError(
+                f"tests.{name}: this version's evaluate knows no {key}; allowed here: {', '.join(section)}"
+            )
+        section[last] = value
+    checked = from_dict(values, EvaluationConfig, f"tests.{name}.")
+    if spec.program == PROGRAM and checked.task.workspace not in (None, *WORKSPACES):
+        get_workspace(checked.task.workspace)
+
+
+def _different(spec: Spec) -> list[dict[str, Any]]:
+    """Return as many different random settings as are wanted, fewer if hundreds of draws in a row bring none."""
+    found: list[dict[str, Any]] = []
+    wanted, fruitless = spec.search.trials or 0, 0
+    for setting in parameters.draws(spec.parameters, spec.search.seed):
+        if len(found) >= wanted or fruitless > 500:
+            break
+        fruitless = fruitless + 1 if setting in found else 0
+        if not fruitless:
+            found.append(setting)
+    return found

@@ -1,0 +1,39 @@
+"""Names that only the registries know: checked by a dry run, since they bring JAX and MuJoCo with them."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from pregrasp_jax.messages import lookup
+from pregrasp_jax.policies.scripts import SCRIPTS
+from pregrasp_jax.robot import ROBOTS
+from pregrasp_jax.spaces.workspace import WORKSPACES
+from pregrasp_jax.sweep.checks import settings_to_check
+from pregrasp_jax.sweep.spec import Spec
+from pregrasp_jax.task.registry import KINDS
+
+_TABLES: Mapping[str, Mapping[str, Any]] = {
+    "task.robot": ROBOTS, "task.primitive": KINDS, "task.workspace": WORKSPACES
+}  # fmt: skip
+
+
+def check_names(spec: Spec) -> None:
+    """Refuse robots, places, tasks and policies that this version does not have.
+
+    Raises:
+        ValueError: one line names the first.
+    """
+    for key, name in _given(spec):
+        lookup(_TABLES[key], name, key=key)
+    for label, variant in spec.variants.items():
+        policy = variant.policy
+        if policy is not None and policy not in (*SCRIPTS, "pretrained") and not Path(policy).exists():
+            known = ", ".join([*SCRIPTS, "pretrained"])
+            raise ValueError(f"variants.{label}.policy = {policy!r} is unknown here; allowed: {known}, or a run folder")
+
+
+def _given(spec: Spec) -> Iterator[tuple[str, str]]:
+    for settings in [spec.set, *(varied for varied, _ in settings_to_check(spec)), *spec.tests.values()]:
+        for key in _TABLES:
+            if settings.get(key) is not None:
+                yield key, settings[key]

@@ -1,0 +1,88 @@
+"""The place of a task: found by its name and dimensions, and refused where robot or scenes do not fit in."""
+
+import dataclasses
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pregrasp_jax.config import TaskConfig
+from pregrasp_jax.robot.base import Robot
+from pregrasp_jax.robot.clearance import CLEARANCE_MARGIN
+from pregrasp_jax.scene.bank import SceneBank
+from pregrasp_jax.scene.packing import MAX_RADIUS
+from pregrasp_jax.spaces.workspace import Workspace, get_workspace
+from pregrasp_jax.task.primitive import Primitive
+from pregrasp_jax.types import OBSTRUCTIONS
+
+_TRIED_ACTIONS = 64
+"""Of those that are allowed at the start, spread over all, to see whether a place can be used at all."""
+
+
+def place_of(task: TaskConfig) -> Workspace:
+    """Return the place of a task, in the dimensions that it asks for."""
+    return get_workspace(task.workspace, dataclasses.asdict(task.place))
+
+
+def refuse_walls(robot: Robot, workspace: Workspace) -> None:
+    """Refuse a place whose walls are where the robot starts or where scenes are packed.
+
+    Raises:
+        ValueError: one line says which wall, and what is allowed.
+    """
+    for index, wall in enumerate(workspace.walls):
+        alone = dataclasses.replace(workspace, walls=(wall,))
+        reach = wall.distance_to_origin()
+        if reach < MAX_RADIUS:
+            raise ValueError(
+                f"workspace '{workspace.name}': wall {index} comes within {reach:.3f} m of the centre, where scenes "
+                f"are packed; allowed is {MAX_RADIUS} m or more"
+            )
+        clear = min(float(robot.clearance(jnp.asarray(home), alone)) for home in robot.homes)
+        if clear < CLEARANCE_MARGIN:
+            raise ValueError(
+                f"workspace '{workspace.name}': wall {index} is {clear:.3f} m from robot {robot.name} at its start "
+                f"pose; allowed is {CLEARANCE_MARGIN} m or more"
+            )
+
+
+def refuse_scenes(workspace: Workspace, scenes: SceneBank) -> None:
+    """Refuse a place in which an object of a scene has left at the start, under some yaw.
+
+    Raises:
+        ValueError: one line says how far it stands from the centre.
+    """
+    reach = float(np.linalg.norm(scenes.poses[..., :2], axis=-1)[scenes.object_ids >= 0].max())
+    limit = float(np.abs([workspace.low, workspace.high]).min())
+    if reach > limit:
+        raise ValueError(
+            f"workspace '{workspace.name}': objects leave {limit:g} m from the centre, but in {scenes.split} scenes "
+            f"they stand up to {reach:.3f} m from it; allowed is a place at least that wide"
+        )
+
+
+def refuse_blocked(robot: Robot, workspace: Workspace, primitive: Primitive) -> None:
+    """Refuse a place between whose walls no action can be executed at the start.
+
+    Raises:
+        ValueError: one line says what is in the way.
+    """
+    if not workspace.walls:
+        return
+    start = jax.tree.map(jnp.asarray, robot.start)
+    allowed = np.flatnonzero(primitive.mask(start))
+    tried = jnp.asarray(allowed[:: -(-len(allowed) // _TRIED_ACTIONS)], jnp.int32)
+
+    @jax.jit
+    @jax.vmap
+    def obstruction(action: jax.Array) -> jax.Array:
+        return primitive.plan(jnp.asarray(robot.home), primitive.decode(start, action)).obstruction
+
+    found = Counter(OBSTRUCTIONS[code] for code in np.asarray(obstruction(tried)))
+    if not found["none"]:
+        reasons = ", ".join(f"{name} {count}" for name, count in found.most_common())
+        raise ValueError(
+            f"workspace '{workspace.name}': none of {len(tried)} pushes from the start pose of robot {robot.name} can "
+            f"be executed ({reasons}); allowed are walls that leave room for some"
+        )

@@ -1,0 +1,122 @@
+"""A whole cell by the command line, dry: files in, a push out, a log, its pictures; and the check of a calibration."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from bundles import small_bundle
+from PIL import Image
+
+from pregrasp_jax.cli.main import main
+from pregrasp_jax.deploy.bundle import read_bundle
+from pregrasp_jax.deploy.golden import golden_camera
+
+BUNDLE = read_bundle(small_bundle())
+GOLDEN = BUNDLE.arrays("golden.npz")
+CAMERA = golden_camera(GOLDEN)
+ROOT = Path(__file__).parent.parent
+
+
+def write_cell(folder: Path, *, tilt_deg: float = 0.0, **sections: object) -> Path:
+    """Write a cell.yaml for the camera of the golden images, and what it names."""
+    pose = CAMERA.world_from_optical.copy()
+    angle = np.deg2rad(tilt_deg)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    pose[:3, :3] = turn @ pose[:3, :3]
+    camera = {
+        "intrinsics": CAMERA.matrix.tolist(),
+        "extrinsics": pose.tolist(),
+        "parent": "table",
+        "depth": "depth.npy",
+    }
+    np.save(folder / "depth.npy", GOLDEN["depth"][0])
+    Image.fromarray(GOLDEN["instances"][0]).save(folder / "ids.png")
+    cell = {
+        "camera": camera | {"depth_scale": 1e-4},
+        "segmenter": {"kind": "file", "file": "ids.png"},
+        "target": {"name": str(int(GOLDEN["target_id"][0]))},
+    }
+    (folder / "cell.yaml").write_text(yaml.safe_dump(cell | sections))
+    return folder / "cell.yaml"
+
+
+def test_a_dry_trial_is_decided_logged_and_drawn(tmp_path: Path, capsys):
+    cell, log = write_cell(tmp_path), tmp_path / "log"
+    assert main(["deploy", str(small_bundle()), "--config", str(cell), "--once", "True", "--log", str(log)]) == 0
+    said = capsys.readouterr().out
+    assert "push 1: hand" in said and "dry: moveL([" in said and "once after 1 pushes" in said
+    about = json.loads((log / "decision-000.json").read_text())
+    assert about["push"]["action"] == GOLDEN["action"][0] and about["close"] is False
+    assert set(about["times_ms"]) == {
+        "segmentation",
+        "reading",
+        "drawing",
+        "projection",
+        "region",
+        "network",
+        "decoding",
+    }
+    np.testing.assert_allclose(about["push"]["end_table_m"][:2], GOLDEN["push"][0, :2], atol=1e-6)
+    with np.load(log / "decision-000.npz") as held:
+        assert np.abs(held["q"] - GOLDEN["q"][0]).max() < 0.2 and held["depth"].dtype == np.uint16
+    assert json.loads((log / "result.json").read_text()) == {"reason": "once", "pushes": 1}
+    assert main(["deploy", "--replay", str(log)]) == 0
+    with Image.open(log / "decision-000.png") as picture:
+        assert picture.size == (1200, 300)
+    for options, problem in (
+        (["deploy", str(small_bundle()), "--config", str(cell), "--log", str(log)], "of an earlier trial"),
+        (["deploy", "--replay", str(tmp_path)], "holds no decisions"),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            main(options)
+        assert stopped.value.code == 2 and problem in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("sections", "said"),
+    [
+        ({"target": {"name": "77"}}, "target name '77' was not found"),
+        ({"target": {}}, "allowed is one of index, name and pixel"),
+        ({"segmenter": {"kind": "file"}}, "segmenter.file is missing"),
+        ({"camera": {"intrinsics": CAMERA.matrix.tolist(), "depth": "depth.npy"}}, "camera.extrinsics is missing"),
+    ],
+)
+def test_what_a_cell_lacks_is_one_line(tmp_path: Path, sections: dict, said: str, capsys):
+    cell = write_cell(tmp_path, **sections)
+    with pytest.raises(SystemExit) as stopped:
+        main(["deploy", str(small_bundle()), "--config", str(cell), "--once", "True"])
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and said in error and error.count("\n") == 1, error
+
+
+def test_the_tabletop_segmenter_finds_the_target_by_a_pixel(tmp_path: Path, capsys):
+    rows, columns = np.nonzero(GOLDEN["instances"][0] == GOLDEN["target_id"][0])
+    pixel = [int(np.median(columns)), int(np.median(rows))]
+    cell = write_cell(tmp_path, segmenter={"kind": "tabletop"}, target={"pixel": pixel})
+    assert main(["deploy", str(small_bundle()), "--config", str(cell), "--once", "True"]) == 0
+    assert "push 1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("tilt", "code"), [(0.0, 0), (1.0, 1)])
+def test_a_calibration_is_checked_against_the_table(tmp_path: Path, tilt: float, code: int, capsys):
+    cell = write_cell(tmp_path, tilt_deg=tilt)
+    Image.fromarray(np.full(CAMERA.shape, 10_000, np.uint16)).save(tmp_path / "empty.png")
+    files = ["--depth", str(tmp_path / "empty.png"), "--png", str(tmp_path / "check.png")]
+    assert main(["calibrate-check", str(cell), "--bundle", str(small_bundle()), *files]) == code
+    said = capsys.readouterr().out
+    found = re.search(r"tilt +([\d.]+) degrees", said)
+    assert found and float(found[1]) == pytest.approx(tilt, abs=0.02) and "100% of the pushes" in said
+    with Image.open(tmp_path / "check.png") as picture:
+        colors = np.asarray(picture.convert("RGB"), int)
+    middle, right = colors[250, 250], colors[250, -5]
+    assert middle.min() > 200 and bool(right.min() > 240) == (tilt == 0)
+
+
+def test_the_python_of_the_page_runs(monkeypatch, capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "deploy.md").read_text(), re.DOTALL)
+    exec(compile(code.replace('"bundle"', repr(str(small_bundle()))), "docs/deploy.md", "exec"), {})
+    numbers = [float(x) for x in capsys.readouterr().out.strip(" []\n").split()]
+    assert len(numbers) == 7 and numbers[2] == pytest.approx(0.1, abs=1e-3)

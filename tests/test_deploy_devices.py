@@ -1,0 +1,403 @@
+"""Devices: poses, calibrations, the guard; the real UR client and the RG2 against what stands for them."""
+
+import asyncio
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from bundles import small_bundle
+from scipy.spatial.transform import Rotation
+
+from pregrasp_jax.deploy.build import make_decider
+from pregrasp_jax.deploy.bundle import read_bundle
+from pregrasp_jax.deploy.cell import Cell, camera_of, read_cell
+from pregrasp_jax.deploy.decision import Decider, Push
+from pregrasp_jax.deploy.devices import DeviceError
+from pregrasp_jax.deploy.drivers.dry import DryArm, DryGripper
+from pregrasp_jax.deploy.guard import ArmState, Limits, refuse_motion, refuse_pose, refuse_state
+from pregrasp_jax.deploy.poses import grasp_point, matrix_of_vector, on_table, read_pose, rotation_vector, tcp_pose
+from pregrasp_jax.robot import kinematics
+
+FAKE = Path(__file__).parent / "fake_ur.py"
+
+
+@pytest.fixture(scope="module")
+def decider() -> Decider:
+    return make_decider(read_bundle(small_bundle()), Cell())
+
+
+def push_to(decider: Decider, row: int = 50, col: int = 4) -> Push:
+    joints = np.array(decider.contract.robot.home)
+    push, obstruction = decider.plan((row * 100 + col) * 2 + 1, 1.0, decider.start(), joints)
+    assert not obstruction
+    return push
+
+
+def test_rotation_vectors_are_those_of_scipy():
+    turns = Rotation.random(50, random_state=0).as_matrix()
+    half = Rotation.from_rotvec(np.pi * np.eye(3)).as_matrix()
+    for turn in [*turns, *half, np.eye(3)]:
+        vector = rotation_vector(turn)
+        np.testing.assert_allclose(Rotation.from_rotvec(vector).as_matrix(), turn, atol=1e-6)
+        np.testing.assert_allclose(matrix_of_vector(vector), turn, atol=1e-6)
+
+
+def test_the_tool_pose_brings_the_grasp_point_where_it_was_sent(decider: Decider):
+    arm, push = decider.body.arm, push_to(decider)
+    pose = tcp_pose(arm, push.poses[-1])
+    np.testing.assert_allclose(grasp_point(arm, pose), push.poses[-1, :3], atol=1e-6)
+    flange = kinematics.forward_kinematics(arm, push.joints[-1])[-1]  # another way to the same pose
+    np.testing.assert_allclose(matrix_of_vector(pose[3:]), flange[:3, :3], atol=1e-5)
+    np.testing.assert_allclose(pose[:3], flange[:3, :3] @ [0, 0, 0.172] + flange[:3, 3], atol=1e-5)
+    base = pose[:3]
+    np.testing.assert_allclose([-0.75 - base[0], -base[1], base[2]], push.poses[-1, :3], atol=1e-6)
+
+
+def test_a_robot_below_the_table_reaches_as_far_up(decider: Decider):
+    body, push = on_table(decider.body, 0.05), push_to(decider)
+    solutions = kinematics.hand_inverse_kinematics(body.arm, push.poses[-1])
+    joints = solutions[~np.isnan(solutions).any(axis=1)][0]
+    np.testing.assert_allclose(kinematics.grasp_pose(body.arm, joints)[:3], push.poses[-1, :3], atol=1e-5)
+    links = body.links.matrices(np.concatenate([joints, [0, 0]]))
+    assert links[0, 2, 3] == pytest.approx(-0.05), "it is drawn lower too"
+
+
+QUAT = [0.0, 1.0, 0.0, 0.0]  # x, y, z, w; half a turn about y: looking down
+OLD = {
+    "parameters": {"name": "cell", "calibration_type": "eye_on_base", "robot_base_frame": "base"},
+    "transformation": {"x": 0.75, "y": 0.0, "z": 1.0, "qx": 0.0, "qy": 1.0, "qz": 0.0, "qw": 0.0},
+}
+NEW = {
+    "parameters": {"name": "cell", "calibration_type": "eye_on_base"},
+    "transform": {
+        "translation": {"x": 0.75, "y": 0.0, "z": 1.0},
+        "rotation": {"x": 0.0, "y": 1.0, "z": 0.0, "w": 0.0},
+    },
+}
+MATRIX = np.array([[-1.0, 0, 0, 0.75], [0, 1, 0, 0], [0, 0, -1, 1.0], [0, 0, 0, 1]])
+
+
+def test_calibrations_in_every_form_are_the_same(tmp_path: Path):
+    (tmp_path / "old.yaml").write_text(yaml.safe_dump(OLD))
+    (tmp_path / "new.calib").write_text(yaml.safe_dump(NEW))
+    np.save(tmp_path / "m.npy", MATRIX)
+    np.savetxt(tmp_path / "m.txt", MATRIX)
+    (tmp_path / "m.json").write_text(str(MATRIX.tolist()))
+    for name in ("old.yaml", "new.calib", "m.npy", "m.txt", "m.json"):
+        np.testing.assert_allclose(read_pose(tmp_path / name), MATRIX, atol=1e-12, err_msg=name)
+
+
+def test_calibrations_that_cannot_be_are_refused(tmp_path: Path):
+    path = tmp_path / "c.yaml"
+    on_hand = {**OLD, "parameters": {"calibration_type": "eye_in_hand"}}
+    long = {**OLD, "transformation": {**OLD["transformation"], "qw": 1.0}}
+    short = {**OLD, "transformation": {"x": 1}}
+    for values, said in (
+        (on_hand, "camera on the hand"),
+        (long, "quaternion has length"),
+        (short, "is not a calibration"),
+        ([1, 2], "is not a calibration"),
+        ({"a": 1}, "is not a calibration"),
+    ):
+        path.write_text(yaml.safe_dump(values))
+        with pytest.raises(ValueError, match=said):
+            read_pose(path)
+    np.save(tmp_path / "bad.npy", 2 * MATRIX)
+    with pytest.raises(ValueError, match="no rotation"):
+        read_pose(tmp_path / "bad.npy")
+    with pytest.raises(ValueError, match="allowed are easy_handeye2's"):
+        read_pose(tmp_path / "pose.docx")
+
+
+def cell_file(folder: Path, text: str) -> Path:
+    path = folder / "cell.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_the_frames_of_a_calibration_agree(tmp_path: Path, decider: Decider):
+    intrinsics = "intrinsics: [[617, 0, 319.5], [0, 617, 239.5], [0, 0, 1]]"
+    poses = []
+    for parent, frame, rows in (
+        ("base", "optical", "[[-1,0,0,-0.75],[0,1,0,0],[0,0,-1,1],[0,0,0,1]]"),
+        ("base_link", "optical", "[[1,0,0,0.75],[0,-1,0,0],[0,0,-1,1],[0,0,0,1]]"),
+        ("table", "optical", "[[1,0,0,0],[0,-1,0,0],[0,0,-1,1],[0,0,0,1]]"),
+        ("table", "mujoco", "[[1,0,0,0],[0,1,0,0],[0,0,1,1],[0,0,0,1]]"),
+    ):
+        text = f"camera:\n  {intrinsics}\n  parent: {parent}\n  frame: {frame}\n  extrinsics: {rows}\n"
+        cell = read_cell(cell_file(tmp_path, text))
+        poses.append(camera_of(cell.camera, decider.body.arm, tmp_path).world_from_optical)
+    for pose in poses:
+        np.testing.assert_allclose(pose, poses[-1], atol=1e-6)
+
+
+def test_a_camera_info_is_read(tmp_path: Path, decider: Decider):
+    info = {"width": 640, "height": 480, "k": [617.0, 0, 319.5, 0, 617.0, 239.5, 0, 0, 1], "d": [-0.05, 0.06, 0, 0, 0]}
+    (tmp_path / "info.yaml").write_text(yaml.safe_dump(info))
+    np.save(tmp_path / "m.npy", MATRIX)
+    cell = read_cell(
+        cell_file(tmp_path, "camera:\n  intrinsics: info.yaml\n  extrinsics: m.npy\n  parent: base_link\n")
+    )
+    camera = camera_of(cell.camera, decider.body.arm, tmp_path)
+    assert camera.shape == (480, 640) and camera.distortion[:2] == (-0.05, 0.06) and camera.matrix[0, 0] == 617
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("robots: {}", "unknown config key robots"),
+        ("robot:\n  limits:\n    speed_m_s: 2.0", "robot.limits.speed_m_s = 2.0 is out of range"),
+        ("robot:\n  speed_m_s: 0.3", "robot.speed_m_s = 0.3 is out of range"),
+        ("gripper:\n  force_n: 90", "gripper.force_n = 90.0 is out of range"),
+        ("camera:\n  frame: ros", "camera.frame = 'ros' is unknown"),
+        ("camera:\n  extrinsics: [[1, 2], [a]]", "extrinsics"),
+        ("table: 3", "must be a mapping"),
+        ("[1, 2", "line 1"),
+    ],
+)
+def test_cells_that_cannot_be_are_refused_in_one_line(tmp_path: Path, text: str, said: str):
+    with pytest.raises(ValueError) as stopped:
+        read_cell(cell_file(tmp_path, text))
+    assert said in str(stopped.value) and str(tmp_path) in str(stopped.value) and "\n" not in str(stopped.value)
+
+
+def state(**changes) -> ArmState:
+    good = {"age_s": 0.0, "joints": np.zeros(6), "tcp_pose": np.zeros(6), "force_n": 1.0, "safety_mode": 1}
+    good |= {"protective_stop": False, "emergency_stop": False, "connected": True}
+    return ArmState(**(good | changes))
+
+
+def test_states_in_which_nothing_may_move():
+    refuse_state(state(), Limits())
+    for changes, said in (
+        ({"connected": False}, "link to the arm is down"),
+        ({"age_s": 0.3}, "0.30 s old"),
+        ({"age_s": float("nan")}, "s old"),
+        ({"emergency_stop": True}, "emergency stop"),
+        ({"protective_stop": True}, "protective stop"),
+        ({"safety_mode": 3}, "safety mode 3"),
+        ({"tcp_pose": np.zeros(5)}, "six finite"),
+        ({"tcp_pose": np.full(6, np.nan)}, "six finite"),
+        ({"force_n": 61.0}, "61 N"),
+        ({"force_n": float("nan")}, "nan N"),
+    ):
+        with pytest.raises(DeviceError, match=said):
+            refuse_state(state(**changes), Limits())
+
+
+def test_motions_that_may_not_be():
+    start, end = np.array([-0.3, 0.0, 0.1]), np.array([-0.1, 0.1, 0.1])
+    fine = {"speed": 0.1, "acceleration": 0.5, "limits": Limits()}
+    refuse_motion(start, end, **fine)
+    for change, said in (
+        ({"end": np.array([9.0, 0, 0.1])}, "the box"),
+        ({"end": np.array([-0.1, 0.1, 0.02])}, "the box"),
+        ({"end": np.array([np.nan, 0, 0.1])}, "three finite"),
+        ({"end": np.zeros(2)}, "three finite"),
+        ({"end": np.array([0.2, 0.2, 0.1])}, "m long"),
+        ({"speed": 0.3}, "speed"),
+        ({"speed": float("nan")}, "speed"),
+        ({"acceleration": 9.0}, "acceleration"),
+    ):
+        with pytest.raises(DeviceError, match=said):
+            refuse_motion(**({"start": start, "end": end} | fine | change))
+    for pose in (np.zeros(5), np.full(6, np.inf)):
+        with pytest.raises(DeviceError, match="six finite"):
+            refuse_pose(pose)
+
+
+def test_a_dry_cell_says_what_it_would_send(decider: Decider):
+    said: list[str] = []
+    arm = DryArm(decider.body.arm, Limits(), np.array(decider.contract.robot.home), speed=0.1, say=said.append)
+    gripper, push = DryGripper(say=said.append), push_to(decider)
+    gripper.move(0.0)
+    arm.push(push)
+    np.testing.assert_allclose(arm.joints(), push.joints[-1])
+    assert not gripper.grasp()
+    assert said[0] == "dry: gripper to 0%" and said[1].startswith("dry: moveL([") and "0.1 m/s" in said[1]
+    with pytest.raises(DeviceError, match="speed"):
+        DryArm(decider.body.arm, Limits(), np.zeros(6), speed=0.5).push(push)
+
+
+class Controller:
+    """A fake controller in a process of its own."""
+
+    def __init__(self, mode: str):
+        pytest.importorskip("rtde_control")
+        self.process = subprocess.Popen([sys.executable, FAKE, mode], stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        if self.process.stdout.readline() != "ready\n":
+            self.stop()
+            pytest.skip("the ports of a UR controller are taken on this machine")
+
+    def stop(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@pytest.fixture
+def controller(request: pytest.FixtureRequest):
+    running = Controller(request.param)
+    yield running
+    running.stop()
+
+
+def make_arm(decider: Decider, **limits):
+    from pregrasp_jax.deploy.drivers.ur import UrArm
+
+    slow = Limits(age_s=1.0, **limits)  # this machine may be busy
+    return UrArm("127.0.0.1", decider.body.arm, slow, speed=0.2, acceleration=1.0, payload_kg=0.8)
+
+
+GROUP = pytest.mark.xdist_group("ur_ports")
+
+
+@GROUP
+@pytest.mark.parametrize("controller", ["normal"], indirect=True)
+def test_a_ur_arm_makes_a_push(decider: Decider, controller: Controller):
+    arm, push = make_arm(decider), push_to(decider)
+    try:
+        assert arm.joints().shape == (6,)
+        arm.push(push)
+        here = grasp_point(decider.body.arm, arm.state().tcp_pose)
+        np.testing.assert_allclose(here, push.poses[-1, :3], atol=3e-3)
+        arm.lift(0.05)
+        lifted = grasp_point(decider.body.arm, arm.state().tcp_pose)
+        np.testing.assert_allclose(lifted - here, [0, 0, 0.05], atol=3e-3)
+        with pytest.raises(DeviceError, match="mm from where the push begins"):
+            arm.push(push)
+    finally:
+        arm.close()
+
+
+@GROUP
+@pytest.mark.parametrize(
+    ("controller", "said"),
+    [("protective", "protective stop"), ("stall", "stalled"), ("push", "pushed with 80 N"), ("drop", "link|s old")],
+    indirect=["controller"],
+)
+def test_a_push_that_goes_wrong_ends_in_one_line(decider: Decider, controller: Controller, said: str):
+    arm = make_arm(decider)
+    try:
+        with pytest.raises(DeviceError, match=said) as stopped:
+            arm.push(push_to(decider))
+        assert "\n" not in str(stopped.value)
+    finally:
+        arm.close()
+
+
+@GROUP
+@pytest.mark.parametrize(
+    ("controller", "said"),
+    [("local", "not under remote control"), ("tcp", "tool centre point")],
+    indirect=["controller"],
+)
+def test_a_controller_that_is_not_ready_is_refused(decider: Decider, controller: Controller, said: str):
+    with pytest.raises(DeviceError, match=said):
+        make_arm(decider)
+
+
+def test_no_controller_is_one_line(decider: Decider):
+    pytest.importorskip("rtde_control")
+    from pregrasp_jax.deploy.drivers.ur import UrArm
+
+    with pytest.raises(DeviceError, match=r"no UR controller at 127\.0\.0\.2"):
+        UrArm("127.0.0.2", decider.body.arm, Limits(), speed=0.1, acceleration=0.5)
+
+
+class Gripper:
+    """An RG2 behind Modbus on the loopback: busy for a moment, then as wide as it was told, or as an object is."""
+
+    def __init__(self, *, object_mm: float = 0.0, status: int = 0, forever: bool = False):
+        pymodbus = pytest.importorskip("pymodbus")
+        assert pymodbus
+        self.object, self.extra, self.forever = object_mm * 10, status, forever
+        self.written: list[list[int]] = []
+        self.moved = 0.0
+        self.port: int = 0
+        self.started = threading.Event()
+        self.loop = asyncio.new_event_loop()
+        threading.Thread(target=self._serve, daemon=True).start()
+        assert self.started.wait(10)
+
+    async def _act(self, function, start, address, count, registers, values):
+        del start, count
+        if values:
+            self.written.append(list(values))
+            self.moved = time.monotonic()
+            registers[0x010B] = int(max(values[1], self.object))
+        elif function == 3 and address == 0x010C:
+            busy = self.forever or time.monotonic() - self.moved < 0.1
+            held = self.object > 0 and bool(self.written) and self.written[-1][1] < self.object
+            registers[0x010C] = self.extra | (1 if busy and self.written else 0) | (2 if held and not busy else 0)
+
+    def _serve(self) -> None:
+        from pymodbus.server import ModbusTcpServer
+        from pymodbus.simulator import DataType, SimData, SimDevice
+
+        async def run() -> None:
+            data = [SimData(0, values=[0] * 0x420, datatype=DataType.REGISTERS)]
+            device = SimDevice(id=65, simdata=data, action=self._act)
+            self.server = ModbusTcpServer(device, address=("127.0.0.1", 0))
+            await self.server.serve_forever(background=True)
+            self.port = self.server.transport.sockets[0].getsockname()[1]
+            self.started.set()
+            await asyncio.Event().wait()
+
+        asyncio.set_event_loop(self.loop)
+        self.loop.run_until_complete(run())
+
+    def connect(self, **options):
+        from pregrasp_jax.deploy.drivers.rg2 import Rg2
+
+        return Rg2("127.0.0.1", port=self.port, **options)
+
+
+def test_a_gripper_opens_closes_and_holds():
+    server = Gripper(object_mm=60)
+    gripper = server.connect(force_n=20)
+    gripper.move(1.0)
+    assert server.written[-1] == [200, 1100, 16] and gripper.opening() == pytest.approx(1.0)
+    gripper.move(0.8)
+    assert gripper.opening() == pytest.approx(0.8)
+    assert gripper.grasp() and gripper.opening() == pytest.approx(60 / 110)
+    with pytest.raises(DeviceError, match="allowed is 0 to 1"):
+        gripper.move(float("nan"))
+    gripper.close()
+    empty = Gripper().connect()
+    assert not empty.grasp()
+
+
+def test_a_gripper_that_must_not_go_on():
+    with pytest.raises(DeviceError, match="safety switch"):
+        Gripper(status=0b100).connect()
+    with pytest.raises(DeviceError, match="is its unit id 66"):
+        Gripper().connect(unit=66)
+    with pytest.raises(DeviceError, match="no gripper at 127"):
+        from pregrasp_jax.deploy.drivers.rg2 import Rg2
+
+        Rg2("127.0.0.1", port=1)
+    with pytest.raises(ValueError, match="out of range"):
+        Gripper().connect(force_n=90)
+    stuck = Gripper(forever=True)
+    ticks = iter(np.arange(0.0, 1000.0, 1.0))
+    with pytest.raises(DeviceError, match="still busy"):
+        stuck.connect(clock=lambda: float(next(ticks))).move(0.5)
+    assert stuck.written[-1][2] == 8, "it is told to stop"
+
+
+def test_a_command_line_without_a_cell_moves_nothing(capsys):
+    from pregrasp_jax.cli.main import main
+
+    for options, said in (
+        (["--arm", "ur"], "--config is missing"),
+        (["--arm", "sim", "--gripper", "dry"], "allowed is sim with sim"),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            main(["deploy", str(small_bundle()), *options])
+        assert stopped.value.code == 2 and said in capsys.readouterr().err

@@ -1,0 +1,388 @@
+"""The runtime without JAX: what it computes is what the package computes, and what it cannot use it refuses."""
+
+import dataclasses
+import functools
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from bundles import small_bundle
+
+from pregrasp_jax import heightmap
+from pregrasp_jax.config import TaskConfig
+from pregrasp_jax.deploy.bundle import read_bundle
+from pregrasp_jax.deploy.camera import PinholeCamera, depth_in_metres
+from pregrasp_jax.deploy.decision import Decider, allowed_pushes, workspace_of
+from pregrasp_jax.deploy.files import masks_of_ids, read_masks
+from pregrasp_jax.deploy.golden import golden_camera
+from pregrasp_jax.deploy.masks import Masks, Target, from_mask_rcnn, fuse
+from pregrasp_jax.deploy.policy import load_values
+from pregrasp_jax.deploy.projection import Maps, make_crop, project, to_maps
+from pregrasp_jax.deploy.tabletop import components
+from pregrasp_jax.geometry import rigid_inverse
+from pregrasp_jax.heightmap.views import project_upward
+from pregrasp_jax.robot import clearance, description, get_robot, kinematics, robot_file
+from pregrasp_jax.robot.following import follow
+from pregrasp_jax.spaces.workspace import TABLE, Box, Workspace
+from pregrasp_jax.task.push import make_push
+from pregrasp_jax.types import OBSTRUCTIONS
+
+ROBOT = get_robot("ur5e_rg2")
+BUNDLE = read_bundle(small_bundle())
+GOLDEN = BUNDLE.arrays("golden.npz")
+CAMERA = golden_camera(GOLDEN)
+CROP = make_crop(CAMERA)
+BODY = robot_file.from_arrays(BUNDLE.arrays("robot.npz"))
+LABELS = BUNDLE.contract.grid.labels
+WALLED = Workspace(name="walled", walls=(Box(center=(0.0, 0.32, 0.1), half_size=(0.3, 0.02, 0.1), yaw=0.1),))
+
+DECIDE = """
+import sys
+
+class Forbidden:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("jax", "jaxlib", "flax", "mujoco", "optax", "torch"):
+            raise AssertionError(f"{name} was imported")
+
+sys.meta_path.insert(0, Forbidden())
+import numpy as np
+from pregrasp_jax.cli import deploy as _, export as _
+from pregrasp_jax.deploy import build, calibrate, log, loop
+from pregrasp_jax.deploy.bundle import read_bundle
+from pregrasp_jax.deploy.cell import Cell
+from pregrasp_jax.deploy.drivers import rg2, ur
+from pregrasp_jax.deploy.golden import heightmap_agreement
+from pregrasp_jax.deploy.projection import Maps
+bundle = read_bundle(sys.argv[1])
+golden = bundle.arrays("golden.npz")
+print(*heightmap_agreement(bundle, golden))
+decider = build.make_decider(bundle, Cell())
+maps = Maps(golden["height_m"][0], golden["labels"][0], 1.0)
+print(decider.decide(maps, decider.start(), np.array(bundle.contract.robot.home)).push.action, golden["action"][0])
+"""
+
+
+def test_nothing_of_it_imports_jax_or_mujoco():
+    done = subprocess.run([sys.executable, "-c", DECIDE, small_bundle()], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    near, same, action, golden = done.stdout.split()
+    assert float(near) >= 0.995 and float(same) >= 0.99 and action == golden
+
+
+def random_joints(count: int) -> np.ndarray:
+    return np.random.default_rng(1).uniform(-2.5, 2.5, (count, 8)).astype(np.float32)
+
+
+def test_kinematics_of_numpy_are_those_of_jax():
+    joints, arm = random_joints(20), ROBOT.body.arm
+    flange = np.stack([kinematics.forward_kinematics(BODY.arm, row[:6])[-1] for row in joints])
+    forward = jax.jit(jax.vmap(lambda q: kinematics.forward_kinematics(arm, q)[-1]))
+    wanted = np.asarray(forward(jnp.asarray(joints[:, :6])))
+    np.testing.assert_allclose(flange, wanted, atol=2e-6)
+    found = kinematics.inverse_kinematics(BODY.arm, flange)
+    inverse = jax.jit(jax.vmap(lambda pose: kinematics.inverse_kinematics(arm, pose)))
+    solved = np.asarray(inverse(jnp.asarray(flange, jnp.float32)))
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(solved))
+    turn = np.angle(np.exp(1j * (found - solved)))
+    assert np.nanmax(np.abs(turn)) < 5e-3, "float32 of jax near singular postures"
+    links = jax.jit(ROBOT.links.matrices)(jnp.asarray(joints[0]))
+    np.testing.assert_allclose(BODY.links.matrices(joints.astype(float))[0], np.asarray(links), atol=2e-6)
+
+
+def test_clearance_of_numpy_is_that_of_jax():
+    joints = random_joints(12)
+    for measure, geoms, rest in (
+        (clearance.height_above_table, BODY.above_table, ()),
+        (clearance.distance_to_walls, BODY.moving, (WALLED,)),
+    ):
+        own = measure(BODY.links, geoms, joints.astype(float), *rest)
+        of_jax = jax.jit(jax.vmap(lambda q, m=measure, r=rest, g=geoms: m(ROBOT.links, g, q, *r)))
+        np.testing.assert_allclose(own, np.asarray(of_jax(jnp.asarray(joints))), atol=1e-5)
+
+
+@pytest.mark.parametrize("place", [TABLE, WALLED], ids=lambda place: place.name)
+def test_what_keeps_the_hand_from_a_path_is_the_same(place: Workspace):
+    ends = [(0.1, 0.0, 0.1), (0.1, 0.26, 0.1), (0.4, 0.0, 0.1), (0.0, 0.0, 0.01), (0.9, 0.0, 0.1)]
+    jitted = jax.jit(ROBOT.follow, static_argnums=3)
+    for x, y, z in ends:
+        poses = np.zeros((30, 7))
+        share = np.linspace(0, 1, 30)[:, None]
+        poses[:, :3], poses[:, 3] = np.array([-0.3, 0, 0.1]) + share * (np.array([x, y, z]) - [-0.3, 0, 0.1]), 1.0
+        apertures = np.full(30, 1.2)
+        found = follow(BODY, np.array(ROBOT.home[:6], float), poses, apertures, place, dt=0.02)
+        controls, code = jitted(
+            jnp.asarray(ROBOT.home), jnp.asarray(poses, jnp.float32), jnp.asarray(apertures, jnp.float32), place
+        )
+        own = np.zeros(30, int)
+        for name in reversed(found.holds):
+            own = np.where(found.holds[name], OBSTRUCTIONS.index(name), own)
+        np.testing.assert_array_equal(own, np.asarray(code))
+        free, lead = own == 0, description.feed_forward()[:6]
+        commanded = found.path + lead * found.velocity
+        np.testing.assert_allclose(commanded[free], np.asarray(controls)[free, :6], atol=2e-3)
+
+
+@functools.partial(jax.jit, static_argnames="cell")
+def upward(depth: jax.Array, labels: jax.Array, *, cell: str = "max") -> tuple[jax.Array, jax.Array]:
+    """Return what the package makes of a depth image; NaN is none."""
+    points = heightmap.unproject(depth, heightmap.overhead_camera())
+    return project_upward(jnp.nan_to_num(points), labels, jnp.isfinite(depth), cell=cell)
+
+
+@pytest.mark.parametrize("cell", ["max", "second", "median"])
+def test_projection_is_that_of_the_package(cell: str):
+    rng = np.random.default_rng(3)
+    depth = (1.0 - rng.random(CAMERA.shape) * 0.3).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.3] = np.nan
+    labels = rng.integers(0, 3, depth.shape).astype(np.uint8)
+    maps = to_maps(depth[CROP.rows, CROP.columns], labels[CROP.rows, CROP.columns], camera=CAMERA, crop=CROP, cell=cell)
+    height, wanted = upward(jnp.asarray(depth), jnp.asarray(labels), cell=cell)
+    off = np.abs(maps.height_m - np.asarray(height))
+    assert (off <= 1e-5).mean() > 0.997, "but for pixels on the border of two cells"
+    assert (maps.labels == np.asarray(wanted)).mean() > 0.997
+
+
+def test_the_robot_is_drawn_where_the_package_draws_it():
+    def render(joint_pos: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return heightmap.render_pinhole(heightmap.robot_hulls(ROBOT, joint_pos), heightmap.overhead_camera())
+
+    depth, ids = jax.jit(render)(jnp.asarray(GOLDEN["joint_pos"][-1]))
+    blank = np.full(CAMERA.shape, np.nan, np.float32)
+    nothing = np.zeros(CAMERA.shape, np.uint8)
+    joints = GOLDEN["joint_pos"][-1]
+    about = {"camera": CAMERA, "crop": CROP, "body": BODY, "joint_pos": joints, "entry": BUNDLE.contract.grid}
+    drawn = project(blank, nothing, **about)
+    height, shown = upward(jnp.where(ids > 0, depth, jnp.nan), ids)
+    robot, wanted = drawn.labels == LABELS["robot"], np.asarray(shown) > 0
+    assert wanted.sum() > 100 and (robot != wanted).sum() <= 0.02 * wanted.sum()
+    both = robot & wanted
+    assert (np.abs(drawn.height_m - np.asarray(height))[both] < 1e-3).mean() > 0.98
+
+
+def test_an_object_above_the_robot_is_not_painted_over():
+    joints = GOLDEN["joint_pos"][-1]
+    high = np.full(CAMERA.shape, 0.3, np.float32)  # 0.7 m above the table everywhere
+    labels = np.full(CAMERA.shape, LABELS["target"], np.uint8)
+    about = {"camera": CAMERA, "crop": CROP, "body": BODY, "joint_pos": joints, "entry": BUNDLE.contract.grid}
+    maps = project(high, labels, **about)
+    assert (maps.labels == LABELS["target"]).any() and not (maps.labels == LABELS["robot"]).any()
+
+
+@pytest.fixture(scope="module")
+def decider() -> Decider:
+    return Decider(
+        contract=BUNDLE.contract, values=load_values(BUNDLE), body=BODY, workspace=workspace_of(BUNDLE.contract)
+    )
+
+
+def golden_maps(index: int) -> Maps:
+    return Maps(GOLDEN["height_m"][index], GOLDEN["labels"][index], 1.0)
+
+
+def joints_of(index: int) -> np.ndarray:
+    return GOLDEN["joint_pos"][index]
+
+
+def test_pushes_are_the_golden_ones(decider: Decider):
+    for index in range(2):
+        hand = decider.start()._replace(xy=GOLDEN["p1_m"][index].astype(float))
+        found = decider.decide(golden_maps(index), hand, joints_of(index))
+        assert not found.close and found.push is not None and not found.refused
+        assert found.push.action == GOLDEN["action"][index]
+        end = [*found.push.end.xy, found.push.end.z, found.push.end.yaw, found.push.end.aperture]
+        np.testing.assert_allclose(end, GOLDEN["push"][index], atol=1e-6)
+        np.testing.assert_allclose(found.push.poses[-1, :2], found.push.end.xy, atol=1e-9)
+        in_base = rigid_inverse(BODY.arm.world_from_base) @ [*found.push.poses[-1, :3], 1.0]
+        np.testing.assert_allclose(found.push.base_pose[:3], in_base[:3], atol=1e-6)
+
+
+def test_allowed_pushes_are_those_of_the_primitive(decider: Decider):
+    push = make_push(ROBOT, TABLE, TaskConfig(), max_distance=0.2)
+    own = allowed_pushes(BUNDLE.contract.action, decider.start())
+    np.testing.assert_array_equal(own, np.asarray(push.mask(jax.tree.map(jnp.asarray, ROBOT.start))))
+
+
+def test_a_push_that_the_arm_cannot_make_is_passed_over(decider: Decider):
+    best = decider.decide(golden_maps(0), decider.start(), joints_of(0)).push
+    assert best is not None
+    x, y = best.end.xy
+    walls = (Box(center=(float(x), float(y), 0.2), half_size=(0.02, 0.06, 0.2)),)
+    fenced = dataclasses.replace(decider, workspace=dataclasses.replace(TABLE, walls=walls))
+    other = fenced.decide(golden_maps(0), decider.start(), joints_of(0))
+    assert other.push is not None and other.push.action != best.action
+    assert other.refused[0] == (best.action, "wall")
+
+
+def test_the_fingers_close_on_a_target_between_them(decider: Decider):
+    pose = kinematics.grasp_pose(BODY.arm, np.asarray(joints_of(0)[:6], float))
+    for shift, close in ((0.0, True), (0.06, False)):
+        labels = np.zeros((100, 100), np.uint8)
+        row, col = int((pose[1] + 0.25 + shift) / 0.005), int((pose[0] + 0.25) / 0.005)
+        maps = Maps(np.zeros((100, 100), np.float32), labels, 1.0)
+        inside = slice(max(col - 2, 0), max(col + 3, 1))
+        labels[row - 3 : row + 4, inside] = LABELS["target"]
+        if not (labels == LABELS["target"]).any():
+            pytest.skip("the hand is outside of the picture")
+        hand = decider.start()._replace(xy=pose[:2])
+        found = decider.decide(maps, hand, joints_of(0))
+        assert found.close is close, (found.coverage, shift)
+        closed = hand._replace(aperture=np.float64(0.0))
+        assert not decider.decide(maps, closed, joints_of(0)).close, "a closed hand has no closing region"
+
+
+def test_joints_that_cannot_be_are_refused(decider: Decider):
+    for joints, said in (
+        (np.zeros(6), "allowed are 8"),
+        (np.full(8, np.nan), "NaN"),
+        (np.rad2deg(joints_of(0)), "are these degrees?"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            decider.decide(golden_maps(0), decider.start(), joints)
+    empty = Maps(GOLDEN["height_m"][0], np.zeros((100, 100), np.uint8), 1.0)
+    with pytest.raises(ValueError, match="no cell of the map shows the target"):
+        decider.decide(empty, decider.start(), joints_of(0))
+
+
+def test_depth_is_metres_whatever_it_came_as():
+    metres = np.full((48, 64), 1.0, np.float32)
+    metres[:4] = np.nan
+    steps = np.nan_to_num(metres * 1000).astype(np.uint16)
+    for given, scale in ((metres, None), (metres.astype(float), None), (steps, None), (steps, 0.001)):
+        np.testing.assert_allclose(depth_in_metres(given, scale=scale, shape=(48, 64)), metres, atol=1e-6)
+    zeros = np.where(np.isnan(metres), 0, metres)
+    assert np.isnan(depth_in_metres(zeros, scale=None, shape=(48, 64))[:4]).all(), "0 is a hole, not the camera"
+    for given, scale, said in (
+        (metres * 1000, None, "are these millimetres"),
+        (steps, 1.0, "are these millimetres"),
+        (metres[1:], None, "shape"),
+        (np.full((48, 64), np.nan), None, "0% of it has a depth"),
+        (np.ones((48, 64), np.uint8), None, "uint8"),
+        (metres.astype(complex), None, "complex"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            depth_in_metres(given, scale=scale, shape=(48, 64))
+
+
+def camera_at(position=(0.0, 0.0, 1.0), **changes) -> PinholeCamera:
+    pose = CAMERA.world_from_optical.copy()
+    pose[:3, 3] = position
+    given = {"matrix": CAMERA.matrix, "world_from_optical": pose, "shape": CAMERA.shape} | changes
+    return PinholeCamera(**given)
+
+
+def test_cameras_that_cannot_be_are_refused():
+    tilted = CAMERA.world_from_optical.copy()
+    tilted[:3, :3] *= 1.01
+    for changes, said in (
+        ({"world_from_optical": tilted}, "no rotation"),
+        ({"position": (0.0, 0.0, -0.5)}, "below the table"),
+        ({"position": (0.0, 0.0, 1000.0)}, "millimetres"),
+        ({"matrix": np.eye(3)}, "intrinsics"),
+        ({"matrix": CAMERA.matrix.T}, "intrinsics"),
+        ({"distortion": (0.0,)}, "five numbers"),
+        ({"shape": (100, 100)}, "principal point"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            camera_at(**changes)
+    for position in ((0.5, 0.0, 1.0), (0.0, 0.0, 0.3)):
+        with pytest.raises(ValueError, match="does not see the corner"):
+            make_crop(camera_at(position))
+
+
+def test_a_bent_lens_is_straightened():
+    bent = camera_at(distortion=(-0.056, 0.060, 0.0004, 0.0007, -0.016))  # a D455's
+    rays = bent.rays(slice(0, 480), slice(0, 640))
+    turn = CAMERA.world_from_optical[:3, :3]
+    x, y, _ = np.tensordot(turn.T, rays, axes=1)
+    k1, k2, p1, p2, k3 = bent.distortion
+    r2 = x**2 + y**2
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    u = CAMERA.matrix[0, 0] * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)) + CAMERA.matrix[0, 2]
+    v = CAMERA.matrix[1, 1] * (y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y) + CAMERA.matrix[1, 2]
+    columns, rows = np.meshgrid(np.arange(640), np.arange(480))
+    assert max(np.abs(u - columns).max(), np.abs(v - rows).max()) < 1e-2
+
+
+class Tensor:
+    """What torch gives, without torch."""
+
+    def __init__(self, values):
+        self.values = np.asarray(values)
+
+    def detach(self):
+        return self
+
+    def cpu(self):
+        return self
+
+    def __array__(self, dtype=None, copy=None):
+        return self.values if dtype is None else self.values.astype(dtype)
+
+
+def detections(count: int = 3) -> dict:
+    masks = np.zeros((count, 1, 40, 40), np.float32)
+    for index in range(count):
+        masks[index, 0, 2 + 8 * index : 14 + 8 * index, 5:20] = 0.9
+    scores = np.array([0.99, 0.8, 0.3])[:count]
+    boxes = np.zeros((count, 4), np.float32)
+    return {
+        "boxes": Tensor(boxes),
+        "labels": Tensor([44, 47, 1][:count]),
+        "scores": Tensor(scores),
+        "masks": Tensor(masks),
+    }
+
+
+def test_mask_rcnn_as_torchvision_gives_it():
+    masks = from_mask_rcnn([detections()], {44: "bottle", 47: "cup"})
+    assert masks.names == ("bottle", "cup") and masks.masks.dtype == bool, "the third is not sure enough"
+    image = fuse(masks, 1, LABELS, (40, 40))
+    assert image[12, 10] == LABELS["obstacle"], "where they overlap the surer one counts"
+    assert image[15, 10] == LABELS["target"] and image[0, 0] == LABELS["table"]
+    assert Target(name="cup").find(masks) == 1 == Target(pixel=(10, 16)).find(masks) == Target(index=1).find(masks)
+    nothing = from_mask_rcnn([detections(0)])
+    assert nothing.masks.shape == (0, 40, 40)
+    with pytest.raises(ValueError, match="found no object"):
+        Target(index=0).find(nothing)
+    trained = {"labels": [1, 2], "masks": detections(2)["masks"].values[:, 0] > 0.5}
+    np.testing.assert_array_equal(from_mask_rcnn(trained).masks, masks.masks)
+
+
+def test_targets_and_masks_that_are_not_there_are_refused(tmp_path: Path):
+    masks = from_mask_rcnn(detections())
+    for target, said in (
+        (Target(index=5), "allowed is 0 to 1"),
+        (Target(name="mug"), "found: 44, 47"),
+        (Target(pixel=(39, 0)), "lies in none"),
+        (Target(pixel=(99, 0)), "outside of the image"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            target.find(masks)
+    with pytest.raises(ValueError, match="allowed is one of"):
+        Target(index=1, name="mug")
+    with pytest.raises(ValueError, match="allowed is N x 30 x 40"):
+        fuse(masks, 0, LABELS, (30, 40))
+    hidden = Masks(np.stack([masks.masks[0], masks.masks[0]]), ("a", "b"), np.array([0.9, 0.8]))
+    with pytest.raises(ValueError, match="0 visible pixels"):
+        fuse(hidden, 1, LABELS, (40, 40))
+    for output in ([], {"labels": [1]}, {"labels": [1], "masks": np.zeros((2, 3, 4, 5))}):
+        with pytest.raises(ValueError, match="Mask R-CNN"):
+            from_mask_rcnn(output)
+    np.savez(tmp_path / "masks.npz", masks=detections()["masks"].values, labels=[44, 47, 1], scores=[0.9, 0.8, 0.2])
+    assert read_masks(tmp_path / "masks.npz").names == ("44", "47")
+    (tmp_path / "masks.png").write_bytes(b"no picture")
+    with pytest.raises(ValueError, match="cannot be read as a picture"):
+        read_masks(tmp_path / "masks.png")
+    assert masks_of_ids(np.array([[0, 3], [3, 7]])).names == ("3", "7")
+
+
+def test_the_tabletop_segmenter_splits_at_steps():
+    height = np.zeros((30, 30))
+    height[5:15, 5:15], height[5:15, 15:25], height[20:25, 5:25] = 0.2, 0.15, 0.1
+    parts = components(height, height > 0.03)
+    assert [int(part.sum()) for part in parts] == [100, 100, 100]
+    assert len(components(np.where(height > 0, 0.2, 0), height > 0.03)) == 2, "one height that touches is one object"

@@ -1,0 +1,110 @@
+"""A run of PPG that learns from another run's grasps, is stopped, and goes on as if it had not been."""
+
+import dataclasses
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pregrasp_jax.checkpoint import load_policy
+from pregrasp_jax.checkpoint.chunks import Ring
+from pregrasp_jax.checkpoint.state import save
+from pregrasp_jax.config import PRESETS, StrokesConfig
+from pregrasp_jax.evaluation.clearing import Cleared, summary
+from pregrasp_jax.task.push_grasp import stroke_actions
+from pregrasp_jax.training import imitation
+from pregrasp_jax.training.imitation import copy_positives, split
+from pregrasp_jax.training.run_folder import RunFolder
+from pregrasp_jax.training.stroke_collection import blank_positives
+
+ACTIONS = stroke_actions()
+STROKES = StrokesConfig(positives=8, width=1 / 32, epochs=2, batch_size=2, validation_share=0.25)
+
+
+def make_config(**changes):
+    return dataclasses.replace(PRESETS["ppg"], strokes=dataclasses.replace(STROKES, **changes))
+
+
+def grasps(count, capacity=8):
+    rng, positives = np.random.default_rng(0), blank_positives(capacity)
+    positives.height[:count] = rng.integers(0, 200, (count, 100, 100))
+    positives.index[:count] = rng.integers(0, 160_000, count)
+    positives.aperture[:count] = rng.uniform(0.6, 1.1, count)
+    positives.gain[:count] = np.arange(count) * 0.005
+    return positives
+
+
+@pytest.fixture
+def collection(tmp_path):
+    path = tmp_path / "collection"
+    with RunFolder.create(path, make_config()) as folder:
+        save(folder.checkpoints, 6, {"best": jnp.zeros(1)}, Ring(grasps(6), 6), {}, policy="best/")
+    return path
+
+
+def test_grasps_of_another_run_are_copied_as_far_as_there_is_room(collection):
+    for capacity, expected in ((8, 6), (4, 4)):
+        into = blank_positives(capacity)
+        assert copy_positives(collection, into) == expected
+        for name in ("height", "index", "aperture", "gain"):
+            np.testing.assert_array_equal(getattr(into, name)[:expected], getattr(grasps(6), name)[:expected])
+        assert not into.height[expected:].any()
+
+
+def test_the_split_is_disjoint_and_keeps_to_the_singulation_condition():
+    learnt, held_out = split(grasps(8), 8, make_config())
+    assert sorted([*learnt, *held_out]) == list(range(8)) and len(held_out) == 2
+    learnt, held_out = split(grasps(8), 8, make_config(singulation=True))
+    assert sorted([*learnt, *held_out]) == [4, 5, 6, 7], "those that gained more than 15 mm"
+    with pytest.raises(ValueError, match=r"0 of 3 stable grasps can be learnt from .* raise strokes\.positives"):
+        split(grasps(3), 3, make_config(singulation=True))
+
+
+def test_the_measures_of_ppgs_own_protocol():
+    scenes = [
+        Cleared(scene=0, objects=5, removed=4, stable=(True, False, True), collided=1),
+        Cleared(scene=1, objects=8, removed=3, stable=(False, True), collided=0),
+    ]
+    found = summary(scenes)
+    assert found["sr_1"] == 0.5 and found["sr_n"] == 3 / 5 and found["clearance"] == (5 / 5 + 4 / 8) / 2
+    assert found["strokes"] == 5 and found["collided"] == 1 and found["sr_1_ci95"][0] > 0
+
+
+class Silent:
+    def say(self, line):
+        pass
+
+    def start(self):
+        pass
+
+    def show(self, text, *, share):
+        pass
+
+
+@pytest.mark.slow
+def test_a_run_that_was_stopped_ends_as_one_that_was_not(collection, tmp_path):
+    config = make_config(collection=str(collection))
+    env = types.SimpleNamespace(primitive=types.SimpleNamespace(actions=ACTIONS))
+
+    def session(path, steps, *, resumed):
+        left = iter([False] * steps)
+        folder = RunFolder.open(path, config) if resumed else RunFolder.create(path, config)
+        with folder:
+            return imitation.run(
+                config,
+                env,
+                folder,
+                Silent(),
+                resumed=resumed,
+                stop=lambda: next(left, True),  # pyright: ignore
+            )
+
+    assert "done: 6 stable grasps" in session(tmp_path / "whole", 100, resumed=False)
+    assert "interrupted at step 3" in session(tmp_path / "parts", 3, resumed=False)
+    assert "done" in session(tmp_path / "parts", 100, resumed=True)
+    whole, parts = (load_policy(tmp_path / name) for name in ("whole", "parts"))
+    for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(parts.params), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert whole.evaluation["start_loss"] > 0 and whole.config == config

@@ -1,0 +1,239 @@
+"""A search that decides: what it reads, what it proposes, how it ranks, and what an evaluation says of it."""
+
+# Host arrays stand for device arrays here, and every shape is known.
+# pyright: reportArgumentType=false, reportOptionalMemberAccess=false
+
+import dataclasses
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pregrasp_jax import io
+from pregrasp_jax.checkpoint import load_policy
+from pregrasp_jax.cli.main import main
+from pregrasp_jax.config import EvaluationConfig, PlanningConfig, SceneConfig
+from pregrasp_jax.evaluation import format_evaluation, load_evaluation
+from pregrasp_jax.evaluation.deliberation import Deliberation
+from pregrasp_jax.evaluation.player import make_player, run_evaluation
+from pregrasp_jax.evaluation.statistics import compare
+from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.planning import search as searching
+from pregrasp_jax.planning.memory import NOTHING, Sight
+from pregrasp_jax.planning.planner import Planned, Planner, spread_best
+from pregrasp_jax.planning.search import chance, search
+from pregrasp_jax.robot.base import hand_pose_of
+from pregrasp_jax.task.env import make_env
+from pregrasp_jax.types import REASONS, EnvState, Observation, PhysicsObservation, SceneParams
+
+
+def make_states(seed: int = 0) -> EnvState:
+    """Three states whose hidden parts depend on `seed`; their pictures do not."""
+    rng, fixed = np.random.default_rng(seed), np.random.default_rng(99)
+    picture = fixed.integers(0, 3, (3, 100, 100)).astype(np.uint8)
+    hand = jax.tree.map(lambda leaf: np.stack([leaf] * 3), hand_pose_of((-0.3, 0.0), z=0.1, yaw=0.0, aperture=1.2))
+    return EnvState(
+        physics=rng.standard_normal((3, 50)),
+        scene=SceneParams(rng.integers(0, 9, (3, 8)), rng.standard_normal((3, 8, 7)), np.array([1, 0, 1])),
+        scene_index=np.array([4, 2, 4]),
+        physics_obs=PhysicsObservation(
+            rng.standard_normal((3, 8, 7)),
+            fixed.standard_normal((3, 8)),
+            rng.standard_normal((3, 7)),
+            rng.integers(0, 2, 3) > 0,
+            rng.integers(0, 9, 3),
+        ),
+        obs=Observation(picture, picture, hand),
+        centroids=rng.standard_normal((3, 8, 3)),
+        num_pushes=np.zeros(3, np.int32),
+    )
+
+
+class Recorder:
+    """A planner that says what it was told."""
+
+    def __init__(self):
+        self.told: list[tuple[Sight, Any, np.ndarray]] = []
+
+    def decide(self, sight: Sight, memory: Any, key: jax.Array) -> Planned:
+        self.told.append((sight, memory, np.asarray(jax.random.key_data(key))))
+        return Planned(len(self.told), ("memory", len(self.told)))
+
+
+def test_a_planner_is_told_what_the_camera_sees_and_where_the_joints_are():
+    told = []
+    for seed in (0, 1):
+        recorder = Recorder()
+        actions = Deliberation(recorder, jax.random.key(3))(make_states(seed), np.ones(3, bool))
+        told.append(recorder.told)
+        assert actions.tolist() == [1, 2, 1]  # scene 4 stands there twice
+    assert Sight._fields == ("obs", "joint_pos", "target")
+    jax.tree.map(np.testing.assert_array_equal, *told)
+    assert [memory for _, memory, _ in told[0]] == [NOTHING] * 2
+
+
+def test_every_episode_has_its_own_memory_and_forgets_it_at_the_end():
+    recorder, states = Recorder(), make_states()
+    deliberation = Deliberation(recorder, jax.random.key(0))
+    deliberation(states, np.array([True, True, False]))
+    assert deliberation(states.replace(num_pushes=np.ones(3, np.int32)), np.array([True, True, False])).tolist()[2] == 0
+    assert [memory for _, memory, _ in recorder.told[2:]] == [("memory", 1), ("memory", 2)]
+    deliberation(states, np.array([True, False, False]))
+    assert recorder.told[-1][1] is NOTHING
+    keys = [tuple(key) for _, _, key in recorder.told]
+    assert len(set(keys[:4])) == 4 and keys[4] == keys[0]  # scene and number of the push, nothing else
+
+
+def test_proposals_are_apart_and_allowed():
+    values = np.full((100, 100, 2), -np.inf)
+    values[40:60, 40:60] = np.random.default_rng(0).uniform(size=(20, 20, 2))
+    found = spread_best(values, 12)
+    assert found[0] == np.argmax(values)
+    row, col, choice = np.unravel_index(found, values.shape)
+    for i in range(12):
+        for j in range(i):
+            assert choice[i] != choice[j] or max(abs(row[i] - row[j]), abs(col[i] - col[j])) >= 4
+    assert np.isfinite(values.flat[found]).all()
+    values[:] = -np.inf
+    values[3, 3, 1] = 0.5
+    assert spread_best(values, 12) == [np.ravel_multi_index((3, 3, 1), values.shape)]
+
+
+class World:
+    """A rollout of made-up scenes: a push numbered a leads from state s to 10 s + a, and `rules` says what of it."""
+
+    batch = 4
+
+    def __init__(self, rules: dict[int, tuple[str, float]]):
+        self.rules, self.pushes, self.calls = rules, 0, 0
+
+    def push(self, bank: Any, states: np.ndarray, actions: np.ndarray, execute: np.ndarray) -> Any:
+        after = 10 * states + actions
+        told = [self.rules.get(int(state), ("running", 0.5)) for state in after]
+        reason = np.array([REASONS.index(name) for name, _ in told])
+        self.pushes, self.calls = self.pushes + int(execute.sum()), self.calls + 1
+        results = SimpleNamespace(reason=reason, terminated=reason != 0)
+        values = np.array([value for _, value in told])
+        return SimpleNamespace(
+            states=after, results=results, safety=np.ones(len(after)), values=values, actions=np.ones(len(after), int)
+        )
+
+    def succeeded(self, reason: np.ndarray) -> np.ndarray:
+        return reason == REASONS.index("target_in_region")
+
+    def grasp(self, bank: Any, states: np.ndarray, execute: np.ndarray) -> np.ndarray:
+        return execute & (states % 10 != 7)  # what ends with push 7 slips
+
+
+def decide(world: World, candidates: list[int], deadline: float = math.inf, **settings: int) -> int:
+    config = PlanningConfig(**{"variants": 2, "depth": 1} | settings)
+    roots = np.arange(1, config.variants + 1)
+    found = search(world, None, roots, candidates, config, deadline)
+    assert found.pushes == world.pushes
+    return found.action
+
+
+def test_a_success_in_all_variants_beats_one_in_some_and_a_promise():
+    won = ("target_in_region", 0.0)
+    assert decide(World({13: won, 14: won, 24: won, 15: ("running", 1.9), 25: ("running", 1.9)}), [3, 4, 5]) == 4
+
+
+def test_what_slips_or_fails_is_not_chosen():
+    lost = {start + a: ("off_table", 2.0) for start in (10, 20) for a in (3, 4)}
+    slips = {17: ("target_in_region", 0.0), 27: ("target_in_region", 0.0)}
+    assert decide(World(lost | slips), [3, 7, 4, 2]) == 2
+
+
+def test_continuations_tell_promises_apart():
+    """Both look alike after one push; only one of them goes on to a success."""
+    rules = {start + a: ("running", 1.4) for start in (10, 20) for a in (3, 4)}
+    rules |= {131: ("off_table", 0.0), 231: ("off_table", 0.0), 141: ("target_in_region", 0.0)}
+    assert decide(World(rules), [3, 4]) == 4
+    assert decide(World(rules), [3, 4], depth=0) == 3
+
+
+def test_without_time_one_round_decides():
+    world = World({14: ("target_in_region", 0.0)})
+    assert decide(world, [3, 4, 5, 6, 8], deadline=0.0) == 4
+    assert world.pushes == 5 and world.calls == 2
+
+
+def test_chances_rise_with_values():
+    found = chance(np.linspace(-1, 3, 50))
+    assert (np.diff(found) >= 0).all() and 0 < found[0] < 0.1 and 0.9 < found[-1] < 1
+    assert 0 < searching.DISCOUNT < 1 and 0 < searching.SALVAGE < 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["--policy", "clear", "--plan", "True"], "plan = True: policy clear is a script; allowed is pretrained"),
+        (["--policy", "pretrained", "--planning.depth", "1"], "planning.* is set, but plan = False"),
+        (
+            ["--policy", "pretrained", "--plan", "True", "--planning.variants", "0"],
+            "planning.variants = 0 is out of range; allowed is 1 to 8",
+        ),
+        (
+            ["--policy", "pretrained", "--plan", "True", "--planning.budget-ms", "-1"],
+            "planning.budget_ms = -1.0 is out",
+        ),
+    ],
+)
+def test_bad_settings_are_one_line(arguments: list[str], line: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as exit_:
+        main(["evaluate", *arguments])
+    error = capsys.readouterr().err
+    assert exit_.value.code == 2 and error.startswith("error: ") and error.count("\n") == 1 and line in error
+
+
+@pytest.mark.slow
+def test_hidden_state_cannot_leak():
+    """The planner works without objects, scenes and engine of the task, and decides by picture, joints and memory."""
+    policy = load_policy("pretrained")
+    config = dataclasses.replace(policy.config, scene=SceneConfig(test_scenes=2))
+    env = make_env(config, split="test", threads=1)
+    q_function = make_q_function(config.network, policy.config.task, env.primitive.actions)
+    blind = dataclasses.replace(env, bank=None, scenes=None, engine=None, eligible=None)
+    planner = Planner(blind, q_function, policy.params, PlanningConfig(depth=0, variants=1), threads=1)
+    states = jax.device_get(jax.jit(jax.vmap(env.reset_to))(jnp.arange(2)))
+    rng = np.random.default_rng(0)
+    ids, poses = states.scene.object_ids, states.physics_obs.object_poses
+    tampered = states.replace(
+        physics=states.physics.replace(bits=states.physics.bits[:, ::-1], object_ids=ids[::-1]),
+        scene=states.scene.replace(object_ids=ids[:, ::-1], poses=rng.standard_normal(poses.shape)),
+        physics_obs=states.physics_obs.replace(
+            object_poses=rng.standard_normal(poses.shape), hand_pose=rng.standard_normal((2, 7))
+        ),
+        centroids=rng.standard_normal(states.centroids.shape),
+    )
+    first, second = (Deliberation(planner, jax.random.key(0))(s, np.ones(2, bool)) for s in (states, tampered))
+    np.testing.assert_array_equal(first, second)
+    unlike = states.replace(obs=states.obs.replace(instance_ids=states.obs.instance_ids[::-1]))
+    assert (Deliberation(planner, jax.random.key(0))(unlike, np.ones(2, bool)) != first).any()
+
+
+@pytest.mark.slow
+def test_an_evaluation_says_that_planning_was_used(tmp_path: Any):
+    settings = PlanningConfig(depth=0, variants=1)
+    requests = [
+        EvaluationConfig(policy="pretrained", plan=plan, planning=settings if plan else PlanningConfig(), episodes=2)
+        for plan in (True, False)
+    ]
+    documents = []
+    for request in requests:
+        player = make_player(request, say=lambda _: None)
+        documents.append(run_evaluation(request, player))
+    planned, plain = documents
+    assert plain["planning"] is None and planned["planning"]["settings"] == dataclasses.asdict(settings)
+    assert planned["planning"]["per_decision"]["pushes"] >= 16
+    assert "pretrained with planning on 2 seen scenes" in format_evaluation(planned)
+    found = compare(planned, plain)
+    assert found.policies == ("pretrained with planning", "pretrained")
+    assert "planning.depth: 0 | off" in found.settings
+    file = tmp_path / "planned.json"
+    io.write_json(file, planned)
+    assert load_evaluation(file) == planned
