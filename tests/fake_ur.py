@@ -61,7 +61,7 @@ class Controller:
         self.pose, self.velocity, self.goal = list(START), [0.0] * 6, None
         self.speed, self.force = 0.1, [0.0] * 6
         self.runtime, self.status, self.ready, self.safety = 1, 1, 0, 1
-        self.moved, self.frozen, self.dropped, self.stopping = 0.0, False, False, False
+        self.moved, self.frozen, self.dropped, self.stopping, self.answered = 0.0, False, False, False, True
         self.inputs: dict[str, float] = {}
 
     def value(self, name: str):
@@ -109,7 +109,8 @@ class Controller:
         elif self.goal is not None:  # a stop of any kind
             self.goal, self.velocity = None, [0.0] * 6
         asynchronous = code == MOVE_L and int(self.inputs.get("input_int_register_1", 0)) == 1
-        if self.goal is None or asynchronous:
+        self.answered = self.goal is None or asynchronous
+        if self.answered:
             self.ready = 2
 
     def advance(self, dt: float) -> None:
@@ -119,7 +120,9 @@ class Controller:
         left = math.sqrt(sum(x * x for x in along))
         step = min(self.speed * dt, left)
         if left < 1e-6:
-            self.goal, self.velocity, self.ready = None, [0.0] * 6, 2
+            self.goal, self.velocity = None, [0.0] * 6
+            if not self.answered:  # else the client is through with this command, and would take it for the next one's
+                self.ready, self.answered = 2, True
             return
         self.velocity = [x / left * self.speed for x in along] + [0.0] * 3
         self.pose = [p + x / left * step for p, x in zip(self.pose[:3], along, strict=True)] + list(self.goal[3:])
