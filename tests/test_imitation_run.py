@@ -11,6 +11,7 @@ import pytest
 from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.checkpoint.chunks import Ring
 from pregrasp_jax.checkpoint.state import save
+from pregrasp_jax.cli.main import main
 from pregrasp_jax.config import PRESETS, StrokesConfig
 from pregrasp_jax.evaluation.clearing import Cleared, summary
 from pregrasp_jax.task.push_grasp import stroke_actions
@@ -108,3 +109,13 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(collection, tmp_path):
     for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(parts.params), strict=True):
         np.testing.assert_array_equal(a, b)
     assert whole.evaluation["start_loss"] > 0 and whole.config == config
+
+
+def test_the_preset_collects_grasps_learns_from_them_and_is_evaluated(tmp_path, capfd):
+    scenes = "--scene.train-scenes 4 --scene.validation-scenes 2 --train.num-envs 4 --physics.threads 1".split()
+    strokes = "--strokes.positives 4 --strokes.width 0.03125 --strokes.epochs 1 --strokes.batch-size 2".split()
+    assert main(["train", "ppg", "--run-dir", str(tmp_path / "run"), *scenes, *strokes]) == 0
+    assert "done: 4 stable grasps learnt from" in capfd.readouterr().out
+    policy = f"target-ppg:{tmp_path / 'run'}"
+    assert main(["evaluate", "--policy", policy, "--episodes", "2", "--scene.test-scenes", "2"]) == 0
+    assert "on 2 seen scenes" in capfd.readouterr().out

@@ -190,8 +190,8 @@ class _Strokes:
         )
         return StrokeState(state, blank)
 
-    def reset(self, state: StrokeState, scene: SceneParams) -> StrokeState:
-        return self.wrapped(self.base.reset(state.native, scene))
+    def reset(self, state: StrokeState, scene: SceneParams, mirrored: jax.Array | bool = False) -> StrokeState:
+        return self.wrapped(self.base.reset(state.native, scene, mirrored))
 
     def observe(self, state: StrokeState) -> PhysicsObservation:
         return self.base.observe(state.native).replace(touch=state.touch)

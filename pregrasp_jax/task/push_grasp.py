@@ -172,8 +172,8 @@ def taken_away(poses: Any, *, workspace: Workspace) -> Any:
 
 def has_left(poses: Any, workspace: Workspace) -> Any:
     """Return which objects [...] bool at poses [..., 7] are off the table; their origin is on their base."""
-    above = poses[..., :3] + np.array([0, 0, _SUNK], np.float32)
-    return workspace.has_left(above.reshape(-1, 3)).reshape(poses.shape[:-1])
+    above = poses[..., :3].reshape(-1, 3) + np.array([[0, 0, _SUNK]], np.float32)
+    return workspace.has_left(above).reshape(poses.shape[:-1])
 
 
 def tilted(poses: Any) -> Any:
