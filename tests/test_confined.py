@@ -15,6 +15,8 @@ from pregrasp_jax.config import Config, NetworkConfig, PlaceConfig, TaskConfig, 
 from pregrasp_jax.evaluation.player import _task
 from pregrasp_jax.robot import clearance, get_robot
 from pregrasp_jax.robot.base import Robot
+from pregrasp_jax.robot.description import arm
+from pregrasp_jax.robot.kinematics import hand_inverse_kinematics
 from pregrasp_jax.robot.ur5e_rg2 import moving
 from pregrasp_jax.scene.spec import compile_spec, scene_spec
 from pregrasp_jax.spaces import grid
@@ -233,6 +235,24 @@ def test_the_lift_keeps_clear_of_walls_too():
     plan = jax.jit(lambda place: plan_grasp(ROBOT, place, state).obstruction, static_argnums=0)
     assert float(jax.jit(lambda q: ROBOT.clearance(q, board))(ROBOT.home)) > clearance.CLEARANCE_MARGIN
     assert [OBSTRUCTIONS[int(plan(place))] for place in (SHELF, board)] == ["none", "wall"]
+
+
+def test_fingers_that_will_close_on_the_target_need_no_room_to_close_all_the_way():
+    """Closed they reach 34 mm farther ahead: into the back wall."""
+    hand = ROBOT.start.replace(xy=jnp.array([0.22, 0.0]))
+    pose = jnp.array([*hand.xy, hand.z, 1.0, 0.0, 0.0, 0.0])
+    branches = jax.jit(lambda pose: hand_inverse_kinematics(arm(), pose))(pose)
+    posture = branches[jnp.argmin(jnp.linalg.norm(branches - ROBOT.home[None, :6], axis=1))]
+
+    def clear(aperture):
+        joints = jnp.concatenate([posture, jnp.full(2, aperture)])
+        return float(jax.jit(lambda q: ROBOT.clearance(q, SHELF))(joints)) > clearance.CLEARANCE_MARGIN
+
+    assert clear(hand.aperture) and not clear(ROBOT.grasp_aperture)
+    state: Any = SimpleNamespace(hand=hand, physics_obs=SimpleNamespace(joint_pos=jnp.append(posture, jnp.zeros(2))))
+    plan = jax.jit(lambda: plan_grasp(ROBOT, SHELF, state))()
+    assert OBSTRUCTIONS[int(plan.obstruction)] == "none"
+    assert float(plan.ctrl[0, 6]) == pytest.approx(ROBOT.grasp_aperture), "they are told to close all the same"
 
 
 # -- Rules

@@ -107,6 +107,7 @@ def follow(
     num_ctrl: jax.Array,
     seconds: jax.Array,
     hand: HandPose,
+    opening: jax.Array | None = None,
 ) -> Plan:
     """Return the plan of a robot whose hand follows a path.
 
@@ -118,8 +119,12 @@ def follow(
         num_ctrl: () int32 rows to execute.
         seconds: () float32 s.
         hand: the commanded end.
+        opening: [T] aperture that keeps clear of the surroundings, where it is not the commanded one: fingers that are
+            told to close stop at what they grasp.
     """
     poses = jnp.concatenate([path.xy, path.z[:, None], jax.vmap(quat_from_yaw)(path.yaw)], axis=1)
     ctrl, code = robot.follow(joint_pos, poses, path.aperture, workspace)
+    if opening is not None:
+        code = robot.follow(joint_pos, poses, opening, workspace)[1]
     first = code[jnp.argmax(code != OBSTRUCTIONS.index("none"))]
     return make_plan(ctrl, num_ctrl, seconds, first, hand).unless(num_ctrl > len(ctrl), "too_long")
