@@ -71,8 +71,6 @@ def rasterize(
     assert min(shape) >= tile, f"tile {tile} is larger than the image {shape}"
     first, tiles_across, ends = _list_tiles(hulls, shape, tile)
     last_corner = jnp.array(shape, jnp.int32)[None, :] - tile
-    draw = jax.vmap(functools.partial(_draw_tile, limit=limit, tile=tile))
-
     def draw_chunk(carry):
         start, image = carry
         entry = start + jnp.arange(chunk)
@@ -81,7 +79,7 @@ def rasterize(
         step = jnp.stack(jnp.divmod(within, tiles_across[hull]), axis=-1)
         # The last tile of a row or column is pushed back inside: drawing a pixel twice changes nothing.
         corner = jnp.minimum(first[hull] + tile * step, last_corner)
-        keys = draw(hulls.coefficients[hull], corner, hulls.labels[hull], entry < ends[-1])
+        keys = _draw_tiles(hulls.coefficients[hull], corner, hulls.labels[hull], entry < ends[-1], limit, tile)
         return start + chunk, _paste(image, corner, keys)
 
     _, image = jax.lax.while_loop(
@@ -117,6 +115,14 @@ def _list_tiles(hulls: PixelHulls, shape: tuple[int, int], tile: int) -> tuple[j
     return jnp.where(seen[:, None], low, 0.0).astype(jnp.int32), tiles[:, 1], ends
 
 
+@functools.partial(jax.jit, static_argnames=("limit", "tile"))
+def _draw_tiles(
+    coefficients: jax.Array, corners: jax.Array, labels: jax.Array, drawn: jax.Array, limit: float, tile: int
+) -> jax.Array:
+    """Return the keys [C, tile, tile] of C hulls; under `jax.jit`, so that a loop that is mapped traces it once."""
+    return jax.vmap(functools.partial(_draw_tile, limit=limit, tile=tile))(coefficients, corners, labels, drawn)
+
+
 def _draw_tile(
     coefficients: jax.Array, corner: jax.Array, label: jax.Array, drawn: jax.Array, *, limit: float, tile: int
 ) -> jax.Array:
@@ -131,13 +137,18 @@ def _draw_tile(
     top = jnp.full((tile, tile), jnp.inf)
     bottom = jnp.full((tile, tile), -jnp.inf)
     # Unrolled, with selects for min and max (which would also carry NaN): XLA makes one vector loop of it, 20
-    # times faster on a CPU than a reduction over faces.
-    for face in range(coefficients.shape[0]):
-        bound = per_col[face] * pixel[None, :] + (per_row[face] * pixel + at_corner[face])[:, None]
-        upper = jnp.where(bound > unless_upper[face], bound, unless_upper[face])
-        lower = jnp.where(bound < unless_upper[face], bound, unless_upper[face])
-        top = jnp.where(upper < top, upper, top)
-        bottom = jnp.where(lower > bottom, lower, bottom)
+    # times faster on a CPU than a reduction over faces. All of one shape, because jax traces anything else as calls.
+    rows, cols = (jax.lax.broadcast_in_dim(pixel, (tile, tile), (axis,)) for axis in (0, 1))
+    faces = jax.lax.broadcast_in_dim(
+        jnp.stack([per_col, per_row, at_corner, unless_upper]), (4, len(per_col), tile, tile), (0, 1)
+    )
+    for face in range(len(per_col)):
+        along, across, constant, unless = (faces[k, face] for k in range(4))
+        bound = along * cols + (across * rows + constant)
+        upper = jax.lax.select(bound > unless, bound, unless)
+        lower = jax.lax.select(bound < unless, bound, unless)
+        top = jax.lax.select(upper < top, upper, top)
+        bottom = jax.lax.select(lower > bottom, lower, bottom)
     hit = drawn & (top >= bottom) & (top > 0)
     return jnp.where(hit, encode_key(top, label, limit), 0)
 
