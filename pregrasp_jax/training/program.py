@@ -166,6 +166,7 @@ def make_program(
         stages, before=jax.jit(stages.before), run=jax.jit(stages.run), after=jax.jit(stages.after)
     )
 
+    @jax.jit
     def init(key: jax.Array) -> TrainState:
         network_key, actor_key, learner_key = jax.random.split(key, 3)
         actors = init_actors(actor_key, env, config.train.num_envs, vmap=layout.vmap)
