@@ -7,11 +7,11 @@ the program, so that a value out of range is one line before anything compiles.
 import dataclasses
 import operator
 import os
-import types
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
+
+from pregrasp_jax.settings import check_ranges, from_dict
 
 EngineName = Literal["native", "mjx"]
 CameraName = Literal["orthographic", "pinhole"]
@@ -281,13 +281,18 @@ class Config:
     strokes: StrokesConfig = field(default_factory=StrokesConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "Config":
+        """Return the config of nested dicts; see `settings.from_dict`."""
+        return from_dict(values, cls)
+
     def validate(self) -> "Config":
         """Return self.
 
         Raises:
             ValueError: a value is outside its range; one line names the key, the value and the range.
         """
-        _check_ranges(self, _RANGES)
+        check_ranges(self, _RANGES)
         if self.task.r_in >= self.task.r_out:
             raise ValueError(f"task.r_in = {self.task.r_in} must be below task.r_out = {self.task.r_out}")
         if self.scene.min_objects > self.scene.max_objects:
@@ -347,7 +352,7 @@ class PlanningConfig:
         Raises:
             ValueError: a value is outside its range; one line names the key, the value and the range.
         """
-        _check_ranges(self, _PLANNING_RANGES, "planning.")
+        check_ranges(self, _PLANNING_RANGES, "planning.")
         return self
 
 
@@ -371,18 +376,6 @@ class EvaluationConfig:
     """Seed of the policy's own randomness; scenes, yaws and targets are fixed."""
     num_envs: int = 0
     """Scenes side by side, 0 chooses; with `native` results do not depend on it."""
-
-
-def _check_ranges(config: Any, ranges: Mapping[str, tuple[float, float]], prefix: str = "") -> None:
-    """Refuse a value of a config that is outside its range; ``None`` is in any.
-
-    Raises:
-        ValueError: one line names the key after `prefix`, the value and the range.
-    """
-    for key, (low, high) in ranges.items():
-        value = operator.attrgetter(key)(config)
-        if value is not None and not low <= value <= high:
-            raise ValueError(f"{prefix}{key} = {value} is out of range; allowed is {low} to {high}")
 
 
 _RANGES: dict[str, tuple[float, float]] = {
@@ -502,73 +495,6 @@ PRESETS: dict[str, Config] = {
 `paper`: width 1.0, 45 K episodes, as published. `ppg`: a baseline of the paper, another hand and method."""
 
 
-def to_dict(config: Any) -> dict[str, Any]:
-    """Return a config as nested plain dicts, ready for YAML or JSON."""
-    return dataclasses.asdict(config)
-
-
-def from_dict(values: Mapping[str, Any], cls: type = Config, prefix: str = "") -> Any:
-    """Build a config from nested dicts.
-
-    Raises:
-        ValueError: an unknown key or a value of the wrong type; one line names it and what is allowed.
-    """
-    if not isinstance(values, Mapping):
-        raise ValueError(f"{prefix or 'config'} must be a mapping, got {type(values).__name__}")
-    hints = typing.get_type_hints(cls)
-    unknown = sorted(set(values) - set(hints), key=str)
-    if unknown:
-        raise ValueError(f"unknown config key {prefix}{unknown[0]}; allowed here: {', '.join(sorted(hints))}")
-    required = [field.name for field in dataclasses.fields(cls) if _has_no_default(field)]
-    if missing := [name for name in required if name not in values]:
-        raise ValueError(f"config key {prefix}{missing[0]} is missing")
-    return cls(**{name: _read(value, hints[name], f"{prefix}{name}") for name, value in values.items()})
-
-
-def _has_no_default(field: dataclasses.Field[Any]) -> bool:
-    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-
-
-def _read(value: Any, hint: Any, key: str) -> Any:
-    """Return a value as its type hint wants it: a dataclass, a tuple or a mapping of something, or a plain value."""
-    if hint is Any:
-        return value
-    if dataclasses.is_dataclass(hint):
-        return from_dict(value, typing.cast(type, hint), f"{key}.")
-    if typing.get_origin(hint) is tuple:
-        inner = typing.get_args(hint)
-        if not isinstance(value, list | tuple) or (inner[-1] is not Ellipsis and len(value) != len(inner)):
-            count = "" if inner[-1] is Ellipsis else f" of {len(inner)}"
-            raise ValueError(f"{key} = {value!r} has the wrong type; allowed: a list{count}")
-        return tuple(_read(item, inner[0], f"{key}[{index}]") for index, item in enumerate(value))
-    if typing.get_origin(hint) is dict:
-        if not isinstance(value, Mapping):
-            raise ValueError(f"{key} = {value!r} has the wrong type; allowed: a mapping")
-        return {name: _read(item, typing.get_args(hint)[1], f"{key}.{name}") for name, item in value.items()}
-    nested = [
-        option for option in typing.get_args(hint) if dataclasses.is_dataclass(option) or typing.get_origin(option)
-    ]
-    if len(nested) == 1 and isinstance(value, list | tuple | Mapping):
-        return _read(value, nested[0], key)
-    return _checked(value, hint, key)
-
-
-def _checked(value: Any, hint: Any, key: str) -> Any:
-    """Return `value` if it is of type `hint` (an int passes for a float)."""
-    allowed = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
-    words = [word for option in allowed if typing.get_origin(option) is Literal for word in typing.get_args(option)]
-    if words and (value is not None or type(None) not in allowed):
-        if not isinstance(value, typing.Hashable) or value not in words:
-            raise ValueError(f"{key} = {value!r} is unknown; allowed: {', '.join(words)}")
-        return value
-    if float in allowed and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if type(value) not in allowed:
-        names = " or ".join("null" if t is type(None) else t.__name__ for t in allowed)
-        raise ValueError(f"{key} = {value!r} has the wrong type; allowed: {names}")
-    return value
-
-
 def with_absolute_paths(config: Config) -> Config:
     """Return a config whose folders and files mean the same from any working directory."""
     folder, sensor = config.assets.object_dir, config.task.sensor
@@ -578,17 +504,3 @@ def with_absolute_paths(config: Config) -> Config:
     if sensor.endswith((".yaml", ".yml")):
         config = dataclasses.replace(config, task=dataclasses.replace(config.task, sensor=os.path.abspath(sensor)))
     return config
-
-
-def difference(old: Config, new: Config) -> list[str]:
-    """Return one line ``key: old -> new`` for every setting in which two configs differ."""
-    flat_old, flat_new = flatten(to_dict(old)), flatten(to_dict(new))
-    return [f"{key}: {flat_old[key]} -> {flat_new[key]}" for key in flat_old if flat_old[key] != flat_new[key]]
-
-
-def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested settings as one dict with keys such as ``task.r_out``."""
-    flat = {}
-    for key, value in values.items():
-        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
-    return flat

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax import heightmap
-from pregrasp_jax.config import Config, from_dict
+from pregrasp_jax.config import Config
 from pregrasp_jax.deploy.build import make_decider, make_view
 from pregrasp_jax.deploy.bundle import Bundle
 from pregrasp_jax.deploy.cell import CameraSettings, Cell
@@ -132,7 +132,7 @@ def make_programs(bundle: Bundle, cell: Cell) -> Programs:
         ValueError: something of it cannot be used.
     """
     prepare()
-    config, sim = from_dict(bundle.contract.training.config, Config), cell.sim
+    config, sim = Config.from_dict(bundle.contract.training.config), cell.sim
     config = dataclasses.replace(
         config,
         task=dataclasses.replace(config.task, camera="pinhole", sensor=sim.sensor),

@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 from fake_env import ACTIONS, FakeEnv
 
-from pregrasp_jax.config import PRESETS, Config, from_dict, to_dict
+from pregrasp_jax.config import PRESETS, Config
 from pregrasp_jax.learning.q_function import QFunction
+from pregrasp_jax.settings import to_dict
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training import program, session
@@ -52,7 +53,7 @@ def make_config(**train: Any) -> Config:
     values["learner"] |= {"warmup": 9, "updates_per_step": 0.25, "batch_size": 2}
     values["replay"] |= {"capacity": 70}
     values["network"]["width"] = 1.0
-    return from_dict(values).validate()
+    return Config.from_dict(values).validate()
 
 
 def input_fn(obs: Observation, target: jax.Array) -> jax.Array:

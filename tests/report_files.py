@@ -8,8 +8,9 @@ import numpy as np
 import yaml
 
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.config import PRESETS, to_dict
+from pregrasp_jax.config import PRESETS
 from pregrasp_jax.report import Film, Step
+from pregrasp_jax.settings import to_dict
 
 HOSTILE = "<script>alert(\"x\")</script> & 'y'"
 

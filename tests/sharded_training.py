@@ -18,7 +18,8 @@ import fake_training
 import jax
 import jax.numpy as jnp
 
-from pregrasp_jax.config import Config, from_dict, to_dict
+from pregrasp_jax.config import Config
+from pregrasp_jax.settings import to_dict
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training import processes, session
 from pregrasp_jax.training.program import Program, TrainState
@@ -48,7 +49,7 @@ def make_config(episodes: int, fused_iterations: int) -> Config:
     values["exploration"] |= {"branches": 1, "epsilon_start": 0.5}
     values["learner"]["batch_size"] = 4
     values["replay"]["capacity"] = 400
-    return from_dict(values).validate()
+    return Config.from_dict(values).validate()
 
 
 def describe(built: Program, state: TrainState) -> dict[str, Any]:

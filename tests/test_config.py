@@ -9,13 +9,14 @@ import yaml
 
 from pregrasp_jax import config as config_module
 from pregrasp_jax.checkpoint import read_config, write_config
-from pregrasp_jax.config import PRESETS, Config, difference, from_dict, to_dict
+from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.settings import difference, to_dict
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_are_valid_and_survive_yaml(name, tmp_path):
     preset = PRESETS[name].validate()
-    assert from_dict(yaml.safe_load(yaml.safe_dump(to_dict(preset)))) == preset
+    assert Config.from_dict(yaml.safe_load(yaml.safe_dump(to_dict(preset)))) == preset
     write_config(tmp_path / "config.yaml", preset)
     assert read_config(tmp_path / "config.yaml") == preset
 
@@ -45,7 +46,7 @@ def test_a_value_beyond_its_range_is_refused(key):
         section = functools.reduce(lambda inner, part: inner[part], stage, values)
         section[name] = value if section[name] is None else type(section[name])(value)
         with pytest.raises(ValueError, match=rf"^{key} = .* is out of range; allowed is ") as error:
-            from_dict(values).validate()
+            Config.from_dict(values).validate()
         assert "\n" not in str(error.value)
 
 
@@ -65,30 +66,30 @@ def test_a_value_beyond_its_range_is_refused(key):
 )
 def test_what_is_wrong_is_named_with_what_is_allowed(values, said):
     with pytest.raises(ValueError, match=said):
-        from_dict(values)
+        Config.from_dict(values)
 
 
 def test_settings_that_contradict_each_other():
     with pytest.raises(ValueError, match=r"task.r_in = 0.3 must be below task.r_out = 0.2"):
-        from_dict({"task": {"r_in": 0.3}}).validate()
+        Config.from_dict({"task": {"r_in": 0.3}}).validate()
     with pytest.raises(ValueError, match=r"learner.siblings = True is about branches.* exploration.branches of 1"):
-        from_dict({"learner": {"siblings": True}}).validate()
+        Config.from_dict({"learner": {"siblings": True}}).validate()
     with pytest.raises(ValueError, match=r"exploration.branch_spacing = 0.02 is about branches"):
-        from_dict({"exploration": {"branch_spacing": 0.02}}).validate()
-    from_dict({"learner": {"siblings": True}, "exploration": {"branches": 2, "branch_spacing": 0.02}}).validate()
+        Config.from_dict({"exploration": {"branch_spacing": 0.02}}).validate()
+    Config.from_dict({"learner": {"siblings": True}, "exploration": {"branches": 2, "branch_spacing": 0.02}}).validate()
     with pytest.raises(ValueError, match=r"scene.min_objects = 8 must not exceed scene.max_objects = 5"):
-        from_dict({"scene": {"min_objects": 8, "max_objects": 5}}).validate()
+        Config.from_dict({"scene": {"min_objects": 8, "max_objects": 5}}).validate()
 
 
 def test_an_int_passes_for_a_float_but_not_the_reverse():
-    assert from_dict({"network": {"width": 1}}).network.width == 1.0
+    assert Config.from_dict({"network": {"width": 1}}).network.width == 1.0
     with pytest.raises(ValueError, match="wrong type"):
-        from_dict({"seed": 1.0})
+        Config.from_dict({"seed": 1.0})
 
 
 def test_difference_names_every_change():
     old = Config()
-    new = from_dict({"seed": 3, "assets": {"object_dir": "here"}})
+    new = Config.from_dict({"seed": 3, "assets": {"object_dir": "here"}})
     assert difference(old, new) == ["seed: 0 -> 3", "assets.object_dir: None -> here"]
     assert difference(old, Config()) == []
 

@@ -11,8 +11,8 @@ PACKAGE = Path(pregrasp_jax.__file__).parent
 ORDER = [
     ["messages"],
     ["io"],
-    ["spaces", "types", "yaml_file"],
-    ["config", "geometry", "machine", "startup"],
+    ["settings", "spaces", "types", "yaml_file"],
+    ["config", "geometry", "machine", "sensors", "startup"],
     ["assets"],
     ["robot"],
     ["scene"],

@@ -9,7 +9,7 @@ import numpy as np
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.checkpoint.policy import PRETRAINED
-from pregrasp_jax.config import from_dict
+from pregrasp_jax.config import Config
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.task.push import push_actions
@@ -35,5 +35,5 @@ def test_its_evaluation_is_of_these_objects():
     assert document["episodes"] == 200 and document["object_set"] == "seen"
     assert document["success_rate"] == np.mean([row["success"] for row in document["rows"]])
     assert document["policy"] == "pretrained" and len(document["rows"]) == 200
-    trained, evaluated = load_policy("pretrained").config, from_dict(document["config"])
+    trained, evaluated = load_policy("pretrained").config, Config.from_dict(document["config"])
     assert evaluated.network == trained.network and evaluated.task == trained.task

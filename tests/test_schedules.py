@@ -13,7 +13,8 @@ import pytest
 from fake_training import make_config, rows, run, stop_after, timeless
 
 from pregrasp_jax import io
-from pregrasp_jax.config import PRESETS, Config, from_dict, to_dict
+from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.settings import to_dict
 from pregrasp_jax.training import learn, schedules
 
 
@@ -21,7 +22,7 @@ def changed(config: Config, **stages: dict[str, Any]) -> Config:
     values = to_dict(config)
     for stage, settings in stages.items():
         values[stage] |= settings
-    return from_dict(values).validate()
+    return Config.from_dict(values).validate()
 
 
 def ends(config: Config, length: int | None) -> tuple[float, float, float]:
@@ -130,7 +131,7 @@ def test_a_run_of_the_first_release_goes_on(tmp_path):
     del old["train"]["env_steps"], old["replay"]["importance_fraction"]
     del old["learner"]["learning_rate_fraction"], old["exploration"]["epsilon_fraction"]
     old["learner"]["learning_rate_steps"] = 30
-    config = from_dict(old).validate()
+    config = Config.from_dict(old).validate()
     run(tmp_path / "old", config, stop=stop_after(4))
     for file in (tmp_path / "old" / "checkpoints").glob("*/manifest.json"):
         manifest = json.loads(file.read_text())

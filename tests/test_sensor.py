@@ -14,8 +14,9 @@ from pregrasp_jax import heightmap
 from pregrasp_jax.assets import spread
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import Config, TaskConfig
-from pregrasp_jax.heightmap import SENSORS, Sensor, get_sensor, sensor
+from pregrasp_jax.heightmap import sensor
 from pregrasp_jax.heightmap.views import project_upward
+from pregrasp_jax.sensors import SENSORS, Sensor, get_sensor
 from pregrasp_jax.task.env import sensor_of
 from pregrasp_jax.types import ROBOT_ID
 

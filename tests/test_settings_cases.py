@@ -19,8 +19,9 @@ from pregrasp_jax.assets.meshes import load_object_dir
 from pregrasp_jax.assets.settings import ObjectSettings, load_settings
 from pregrasp_jax.checkpoint import load_policy, read_config
 from pregrasp_jax.checkpoint.run_config import CHANGEABLE
-from pregrasp_jax.config import Config, from_dict, to_dict
+from pregrasp_jax.config import Config
 from pregrasp_jax.report import read_run
+from pregrasp_jax.settings import to_dict
 from pregrasp_jax.training import session
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.run_folder import RunFolder, stored_config
@@ -233,7 +234,7 @@ def test_meshes_are_found_from_any_folder_and_may_move(tmp_path, monkeypatch):
     values = to_dict(make_config(episodes=3))
 
     def config_with(folder: str) -> Config:
-        return from_dict(values | {"assets": values["assets"] | {"object_dir": folder}})
+        return Config.from_dict(values | {"assets": values["assets"] | {"object_dir": folder}})
 
     monkeypatch.chdir(tmp_path / "here")
     assert session.train(config_with("meshes"), run, console=quiet) == 0

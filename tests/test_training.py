@@ -23,8 +23,9 @@ from fake_training import (
 )
 
 from pregrasp_jax.checkpoint import checksum, load_policy
-from pregrasp_jax.config import PRESETS, ExplorationConfig, from_dict, to_dict
+from pregrasp_jax.config import PRESETS, Config, ExplorationConfig
 from pregrasp_jax.learning import learner
+from pregrasp_jax.settings import to_dict
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training import collect, learn
 from pregrasp_jax.training.run_folder import RunFolder, stored_config
@@ -57,7 +58,7 @@ def test_branches_are_learned_from_and_change_nothing_else():
     values = to_dict(make_config())
     values["exploration"] |= {"branches": 2, "epsilon_start": 0.5}
     values["replay"] |= {"capacity": 300}
-    built = make_program(from_dict(values))
+    built = make_program(Config.from_dict(values))
     state = jax.jit(built.init)(jax.random.key(0))
     collect_once, remember = jax.jit(built.collect), jax.jit(built.remember)
     params, branch_actions = state.learning.learner.params, []

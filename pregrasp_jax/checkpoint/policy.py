@@ -18,7 +18,8 @@ from pregrasp_jax.checkpoint import trees
 from pregrasp_jax.checkpoint.run_config import CONFIG, stored_config, write_config
 from pregrasp_jax.checkpoint.state import read_newest_policy
 from pregrasp_jax.checkpoint.trees import DamagedFileError
-from pregrasp_jax.config import Config, from_dict, to_dict
+from pregrasp_jax.config import Config
+from pregrasp_jax.settings import to_dict
 
 FORMAT = "pregrasp_jax policy 2"
 """What the header of a policy says that it is."""
@@ -106,7 +107,10 @@ def _read_policy(path: Path) -> TrainedPolicy:
     if _checksum(arrays, metadata) != metadata["checksum"]:
         raise DamagedFileError(f"{path} is altered (checksum differs)")
     try:
-        config, evaluation = from_dict(json.loads(metadata["config"])).validate(), json.loads(metadata["evaluation"])
+        config, evaluation = (
+            Config.from_dict(json.loads(metadata["config"])).validate(),
+            json.loads(metadata["evaluation"]),
+        )
     except ValueError as error:
         raise ValueError(f"{path} was written by another version of this package: {error}") from None
     return TrainedPolicy(trees.nest(arrays), config, evaluation, path)

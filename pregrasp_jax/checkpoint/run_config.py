@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from pregrasp_jax import io, yaml_file
-from pregrasp_jax.config import Config, difference, from_dict, to_dict
+from pregrasp_jax.config import Config
+from pregrasp_jax.settings import difference, to_dict
 
 CHANGEABLE = ("train.minutes", "train.episodes", "train.env_steps", "train.tensorboard", "assets.object_dir")
 """Settings that may change when a run is resumed: when it stops, what it tells, and where its meshes lie, which must
@@ -34,7 +35,7 @@ def read_config(path: Path) -> Config:
     """
     values = yaml_file.read(path)
     try:
-        return from_dict(values).validate()
+        return Config.from_dict(values).validate()
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
@@ -65,7 +66,7 @@ def recorded_config(run: Path) -> Config | None:
     """
     record = read_manifest(run).get("config")
     try:
-        return None if record is None else from_dict(record).validate()
+        return None if record is None else Config.from_dict(record).validate()
     except ValueError as error:
         raise ValueError(f"{run / MANIFEST}: {error}") from None
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pregrasp_jax.config import from_dict
 from pregrasp_jax.deploy.contract import CONTRACT, FORMAT, Contract
 from pregrasp_jax.messages import one_line
+from pregrasp_jax.settings import from_dict
 
 _WANTED = "allowed is a folder that `pregrasp-jax export` has written"
 

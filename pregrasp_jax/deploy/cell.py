@@ -7,12 +7,12 @@ from typing import Any, Literal
 import numpy as np
 
 from pregrasp_jax import yaml_file
-from pregrasp_jax.config import from_dict
 from pregrasp_jax.deploy.camera import PinholeCamera, optical_from, refuse_pose
 from pregrasp_jax.deploy.guard import Limits
 from pregrasp_jax.deploy.masks import Target
 from pregrasp_jax.deploy.poses import read_pose, world_from
 from pregrasp_jax.robot.kinematics import Arm
+from pregrasp_jax.settings import from_dict
 
 Rows = tuple[tuple[float, ...], ...]
 

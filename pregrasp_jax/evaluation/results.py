@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from pregrasp_jax import io
-from pregrasp_jax.config import Config, to_dict
+from pregrasp_jax.config import Config
 from pregrasp_jax.evaluation.statistics import is_interval, is_number, policy_name, wilson_interval, workspace_of
 from pregrasp_jax.machine import versions
+from pregrasp_jax.sensors import get_sensor
+from pregrasp_jax.settings import to_dict
 
 FORMAT = "pregrasp_jax evaluation 1"
 """Marks an evaluation file, so that a foreign JSON is not taken for one."""
@@ -162,8 +164,6 @@ def evaluation_document(
         wall_seconds: s, how long the evaluation took on this machine, compilation included.
         planning: settings of the search that decided and what it took, None without one.
     """
-    from pregrasp_jax.heightmap import get_sensor  # with jax, which readers of evaluations do without
-
     return {
         "format": FORMAT,
         "policy": policy,

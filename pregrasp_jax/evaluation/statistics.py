@@ -8,7 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, TypeGuard
 
-from pregrasp_jax.config import TaskConfig, flatten
+from pregrasp_jax.config import TaskConfig
+from pregrasp_jax.settings import flatten
 
 _Z95 = 1.959963984540054
 """Normal quantile of a two-sided 95 % interval."""

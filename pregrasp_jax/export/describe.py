@@ -8,7 +8,6 @@ import numpy as np
 
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint import TrainedPolicy, checksum
-from pregrasp_jax.config import to_dict
 from pregrasp_jax.deploy.contract import (
     FORMAT,
     ActionEntry,
@@ -28,6 +27,7 @@ from pregrasp_jax.heightmap import SEGMENTATION, overhead_camera
 from pregrasp_jax.learning.networks import num_parameters
 from pregrasp_jax.machine import versions
 from pregrasp_jax.robot.base import Robot
+from pregrasp_jax.settings import to_dict
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace
 from pregrasp_jax.spaces.motion import APERTURE_TIME, SETTLE_TIME

@@ -10,7 +10,7 @@ from pregrasp_jax.heightmap.observation import (
     robot_hulls,
     scene_hulls,
 )
-from pregrasp_jax.heightmap.sensor import SENSORS, Photo, Sensor, episode_key, get_sensor, photograph, sense
+from pregrasp_jax.heightmap.sensor import Photo, episode_key, photograph, sense
 from pregrasp_jax.heightmap.views import (
     Camera,
     HullInstances,
@@ -22,14 +22,11 @@ from pregrasp_jax.heightmap.views import (
 
 __all__ = [
     "SEGMENTATION",
-    "SENSORS",
     "Camera",
     "HullInstances",
     "Photo",
-    "Sensor",
     "episode_key",
     "fuse_segmentation",
-    "get_sensor",
     "network_input",
     "object_hulls",
     "observe",

@@ -71,6 +71,7 @@ def rasterize(
     assert min(shape) >= tile, f"tile {tile} is larger than the image {shape}"
     first, tiles_across, ends = _list_tiles(hulls, shape, tile)
     last_corner = jnp.array(shape, jnp.int32)[None, :] - tile
+
     def draw_chunk(carry):
         start, image = carry
         entry = start + jnp.arange(chunk)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from pregrasp_jax.config import PlanningConfig, to_dict
+from pregrasp_jax.config import PlanningConfig
 from pregrasp_jax.heightmap import overhead_camera, robot_hulls
 from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.planning import memory as remembering
@@ -17,6 +17,7 @@ from pregrasp_jax.planning.memory import Memory, Sight
 from pregrasp_jax.planning.rebuild import draw_variants, hidden_cells
 from pregrasp_jax.planning.rollout import Rollout
 from pregrasp_jax.planning.search import search
+from pregrasp_jax.settings import to_dict
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.types import MAX_OBJECTS, EnvState, HullBank
 

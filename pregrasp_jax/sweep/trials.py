@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from pregrasp_jax import io
-from pregrasp_jax.config import PRESETS, Config, from_dict, to_dict
+from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.settings import to_dict
 from pregrasp_jax.sweep.spec import Spec
 
 EVALUATIONS = "evaluations"
@@ -103,7 +104,7 @@ def trial_config(spec: Spec, settings: Mapping[str, Any]) -> Config:
             near = ", ".join(sorted(section)) if isinstance(section, dict) else ", ".join(sorted(values))
             raise ValueError(f"this version knows no setting {key}; allowed here: {near}")
         section[name] = value
-    return from_dict(values).validate()
+    return Config.from_dict(values).validate()
 
 
 def train_command(spec: Spec, trial: Trial, run: Path) -> list[str]:

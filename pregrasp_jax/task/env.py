@@ -20,13 +20,13 @@ from pregrasp_jax.assets.bank import concatenate
 from pregrasp_jax.assets.sets import load_bank_for
 from pregrasp_jax.assets.variants import MakingProgress, variant_bank
 from pregrasp_jax.config import Config, TaskConfig
-from pregrasp_jax.heightmap import SENSORS, Sensor
 from pregrasp_jax.physics import make_engine
 from pregrasp_jax.physics.base import Engine
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.bank import SPLITS, SceneBank, Split
+from pregrasp_jax.sensors import SENSORS, Sensor, get_sensor
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.workspace import Workspace
 from pregrasp_jax.task import grasp, registry
@@ -313,7 +313,7 @@ def sensor_of(task: TaskConfig) -> Sensor:
     Raises:
         ValueError: there is none of this name, its file cannot be used, or the camera is not the pinhole.
     """
-    sensor = heightmap.get_sensor(task.sensor)
+    sensor = get_sensor(task.sensor)
     if sensor != CLEAN and task.camera != "pinhole":
         raise ValueError(
             f"task.sensor = {task.sensor!r} is what a pinhole camera gets wrong, but task.camera = {task.camera!r}; "

@@ -22,8 +22,9 @@ import numpy as np
 
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint import trees
-from pregrasp_jax.config import Config, from_dict, to_dict
+from pregrasp_jax.config import Config
 from pregrasp_jax.machine import versions
+from pregrasp_jax.settings import to_dict
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.training.mishap import Mishap, no_mishap
 from pregrasp_jax.types import MAX_OBJECTS, SceneParams
@@ -141,7 +142,7 @@ def load_dump(path: Path) -> Dump:
     except (ValueError, KeyError, TypeError, AttributeError):
         raise ValueError(f"{path} is no dump of this version; {_WANTED}") from None
     try:
-        return Dump(path=path, config=from_dict(config).validate(), arrays=arrays, **about)
+        return Dump(path=path, config=Config.from_dict(config).validate(), arrays=arrays, **about)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}; {_WANTED}") from None
 

@@ -25,8 +25,9 @@ from pregrasp_jax.checkpoint.run_config import (
     write_config,
 )
 from pregrasp_jax.checkpoint.state import exists
-from pregrasp_jax.config import Config, difference, to_dict
+from pregrasp_jax.config import Config
 from pregrasp_jax.machine import versions
+from pregrasp_jax.settings import difference, to_dict
 from pregrasp_jax.training.event_log import EventLog
 
 

@@ -10,11 +10,12 @@ import jax
 
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint.policy import load_policy
-from pregrasp_jax.config import Config, to_dict, with_absolute_paths
+from pregrasp_jax.config import Config, with_absolute_paths
 from pregrasp_jax.evaluation import Evaluator
 from pregrasp_jax.evaluation.clearing import own_protocol
 from pregrasp_jax.learning.q_function import Params, make_q_function
 from pregrasp_jax.policies.learned import make_learned
+from pregrasp_jax.settings import to_dict
 from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.training import imitation, processes, resources, trainer
