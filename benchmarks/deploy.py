@@ -70,7 +70,7 @@ def measure_parts(bundle: Any, *, threads: int, repetitions: int) -> dict[str, A
     crop, joints = make_crop(camera), golden["joint_pos"][-1]
     labels = label_image(golden["instances"][-1], int(golden["target_id"][-1]), entry.labels)
     about = {"camera": camera, "crop": crop}
-    robot = {"body": decider.body, "joint_pos": joints, "label": entry.labels["robot"]}
+    robot = {"body": decider.body, "joint_pos": joints, "entry": entry}
 
     def read() -> tuple[np.ndarray, np.ndarray]:
         metres = depth_in_metres(golden["depth"][-1], scale=float(golden["depth_scale"]), shape=camera.shape)
@@ -146,7 +146,7 @@ def play(bundle: Any, *, scenes: range) -> dict[str, Any]:
     hlo = export.deserialize(bytearray(bundle.files["policy.stablehlo"]))
     count: Counter[str] = Counter()
     off = {"onnx": 0.0, "stablehlo": 0.0}
-    near, alike, outcomes = [], [], []
+    near, alike, outcomes, different = [], [], [], []
     for index in scenes:
         scene = SimulatedCell(programs, index)
         station = dataclasses.replace(
@@ -182,6 +182,19 @@ def play(bundle: Any, *, scenes: range) -> dict[str, Any]:
                 same = decision.push.action == int(allowed.argmax())
                 tie = allowed.max() - allowed.reshape(-1)[decision.push.action] <= TIE
                 count["same_push"] += int(same or tie)
+                if not (same or tie):
+                    quantized = np.asarray(grid.quantize_height(np.clip(looked.maps.height_m, 0, 0.3)))
+                    given_up = allowed.max() - allowed.reshape(-1)[decision.push.action]
+                    different.append(
+                        {
+                            "scene": index,
+                            "push": pushes,
+                            "q_given_up": round(float(given_up), 4),
+                            "cells": int((quantized != np.asarray(obs.height)).sum()),
+                            "labels": int((looked.maps.labels != labels).sum()),
+                            "farthest_mm": round(1e3 * float(np.abs(looked.maps.height_m - seen).max()), 1),
+                        }
+                    )
                 count["refused_best"] += int(bool(decision.refused))
             count["close_agrees"] += int(decision.close == ended)
             if decision.close:
@@ -215,6 +228,7 @@ def play(bundle: Any, *, scenes: range) -> dict[str, Any]:
         "labels_same": round(float(np.mean(alike)), 5),
         "decisions": count["decisions"],
         "same_push": count["same_push"] / decisions,
+        "different_pushes": different,
         "best_was_out_of_reach": count["refused_best"] / decisions,
         "closing_agrees": count["close_agrees"] / states,
         "success": outcomes.count("held") / len(outcomes),

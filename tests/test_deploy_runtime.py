@@ -21,7 +21,7 @@ from pregrasp_jax.deploy.files import masks_of_ids, read_masks
 from pregrasp_jax.deploy.golden import golden_camera
 from pregrasp_jax.deploy.masks import Masks, Target, from_mask_rcnn, fuse
 from pregrasp_jax.deploy.policy import load_values
-from pregrasp_jax.deploy.projection import Maps, make_crop, project, to_maps
+from pregrasp_jax.deploy.projection import Maps, draw_robot, make_crop, project, to_maps
 from pregrasp_jax.deploy.tabletop import components
 from pregrasp_jax.geometry import rigid_inverse
 from pregrasp_jax.heightmap.views import project_upward
@@ -144,6 +144,28 @@ def test_projection_is_that_of_the_package(cell: str):
     off = np.abs(maps.height_m - np.asarray(height))
     assert (off <= 1e-5).mean() > 0.997, "but for pixels on the border of two cells"
     assert (maps.labels == np.asarray(wanted)).mean() > 0.997
+
+
+@pytest.mark.parametrize(
+    ("nearer", "label", "robot"),
+    [
+        (0.01, "obstacle", False),
+        (0.01, "table", True),
+        (0.002, "target", True),
+        (-0.05, "obstacle", True),
+        (0.04, "table", False),
+    ],
+)
+def test_what_is_above_the_hand_stays_and_what_is_the_hand_becomes_it(nearer, label, robot):
+    shape, joints = CROP.rays.shape[1:], GOLDEN["joint_pos"][-1]
+    hand, nothing = np.full(shape, np.nan, np.float32), np.full(shape, LABELS["table"], np.uint8)
+    draw_robot(hand, nothing, camera=CAMERA, crop=CROP, body=BODY, joint_pos=joints, entry=BUNDLE.contract.grid)
+    covered = nothing == LABELS["robot"]
+    assert covered.sum() > 1000
+    depth, labels = hand - np.float32(nearer), np.full(shape, LABELS[label], np.uint8)
+    draw_robot(depth, labels, camera=CAMERA, crop=CROP, body=BODY, joint_pos=joints, entry=BUNDLE.contract.grid)
+    assert (labels[covered] == LABELS["robot" if robot else label]).all()
+    np.testing.assert_allclose(depth[covered], hand[covered] - (0 if robot else nearer), atol=1e-6)
 
 
 def test_the_robot_is_drawn_where_the_package_draws_it():

@@ -128,8 +128,8 @@ class Station:
         depth, cut = (image[self.crop.rows, self.crop.columns].copy() for image in (metres, labels))
         clock.lap("reading")
         geometry = {"camera": self.camera, "crop": self.crop}
-        joints, robot = frame.joint_pos, entry.labels["robot"]
-        draw_robot(depth, cut, **geometry, body=self.decider.body, joint_pos=joints, label=robot)
+        joints = frame.joint_pos
+        draw_robot(depth, cut, **geometry, body=self.decider.body, joint_pos=joints, entry=entry)
         clock.lap("drawing")
         maps = to_maps(depth, cut, **geometry, cell=self.cell)
         clock.lap("projection")

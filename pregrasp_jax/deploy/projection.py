@@ -16,7 +16,10 @@ from pregrasp_jax.robot.following import Body
 from pregrasp_jax.spaces import grid
 
 ROBOT_MARGIN = 0.03
-"""m; what the camera sees nearer than the drawn robot by more than this is an object above it, not the robot."""
+"""m; what the camera sees nearer than the drawn robot by more than this is something above it, not the robot."""
+
+OBJECT_MARGIN = 0.004
+"""m, the same where a mask says that it is an object: twice the noise of a stereo camera 1 m away."""
 
 CELLS = ("max", "second", "median")
 """Which of the points above a cell is its height; see `heightmap.sensor`."""
@@ -106,7 +109,7 @@ def project(
         cell: one of `CELLS`.
     """
     depth, label = depth_m[crop.rows, crop.columns].copy(), labels[crop.rows, crop.columns].copy()
-    draw_robot(depth, label, camera=camera, crop=crop, body=body, joint_pos=joint_pos, label=entry.labels["robot"])
+    draw_robot(depth, label, camera=camera, crop=crop, body=body, joint_pos=joint_pos, entry=entry)
     return to_maps(depth, label, camera=camera, crop=crop, cell=cell)
 
 
@@ -118,13 +121,15 @@ def draw_robot(
     crop: Crop,
     body: Body,
     joint_pos: np.ndarray,
-    label: int,
+    entry: GridEntry,
 ) -> None:
     """Draw the robot into a cut depth image and its labels, in place."""
+    label, objects = entry.labels["robot"], [entry.labels[name] for name in ("target", "obstacle")]
     for drawn in draw_hulls(link_hulls(body.links, joint_pos), camera=camera, crop=crop):
         there = (drawn.rows, drawn.columns)
         known = np.isfinite(depth[there])
-        nearer = ~known | (drawn.depth < depth[there] + ROBOT_MARGIN)
+        margin = np.where(np.isin(labels[there], objects), np.float32(OBJECT_MARGIN), np.float32(ROBOT_MARGIN))
+        nearer = ~known | (drawn.depth < depth[there] + margin)
         # Among robot pixels the nearest link counts; what the camera has measured of it does not.
         replace = nearer & ((labels[there] != label) | ~known | (drawn.depth < depth[there]))
         rows, columns = drawn.rows[replace], drawn.columns[replace]
