@@ -1,4 +1,4 @@
-"""The policy that ships with the package: complete, small, and of this version's network."""
+"""The policies that ship with the package: complete, small, and of this version's networks."""
 
 import json
 
@@ -8,16 +8,18 @@ import numpy as np
 
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.checkpoint import load_policy
-from pregrasp_jax.checkpoint.policy import PRETRAINED
+from pregrasp_jax.checkpoint.policy import PRETRAINED, SHIPPED
 from pregrasp_jax.config import Config
+from pregrasp_jax.learning.imitation import StrokeFunction
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.task.push import push_actions
+from pregrasp_jax.task.push_grasp import stroke_actions
 from pregrasp_jax.types import Observation
 
 
 def test_it_is_small_and_fits_its_network():
-    assert sum(file.stat().st_size for file in PRETRAINED.iterdir()) <= 3_000_000
+    assert sum(file.stat().st_size for folder in SHIPPED.values() for file in folder.iterdir()) <= 3_000_000
     policy = load_policy("pretrained")
     robot = get_robot(policy.config.task.robot)
     q = make_q_function(policy.config.network, policy.config.task, push_actions(robot))
@@ -37,3 +39,15 @@ def test_its_evaluation_is_of_these_objects():
     assert document["policy"] == "pretrained" and len(document["rows"]) == 200
     trained, evaluated = load_policy("pretrained").config, Config.from_dict(document["config"])
     assert evaluated.network == trained.network and evaluated.task == trained.task
+
+
+def test_ppg_begins_beside_what_stands_there_and_not_on_it():
+    policy = load_policy("ppg")
+    function = StrokeFunction(policy.config.strokes, stroke_actions())
+    assert function.fits(policy.params) and policy.config.strokes.collection is None
+    height = np.zeros((100, 100), np.float32)
+    height[42:58, 42:58] = 0.15
+    values = np.asarray(jax.jit(function.values)(policy.params, jnp.asarray(height)))
+    rows, cols, _ = np.unravel_index(np.argsort(values.ravel())[-20:], values.shape)
+    distance = 0.005 * np.maximum(np.abs(rows - 49.5) - 7.5, np.abs(cols - 49.5) - 7.5)
+    assert np.isfinite(values).all() and (distance > 0.04).all() and (distance < 0.2).all(), "m from a box of 8 cm"
