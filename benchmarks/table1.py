@@ -2,7 +2,7 @@
 
     python benchmarks/table1.py --out runs/table1 [--sets seen unseen DIR] [--policies ppg target-ppg pretrained ...]
 
-A set is `seen`, `unseen`, or a folder of meshes. Every evaluation is a file in --out; those that are there are not made
+A set is `seen`, `unseen`, or a folder of meshes, whose files begin with `folder-` and its name. Every evaluation is a file in --out; those that are there are not made
 again, so that a run that was stopped goes on. Counted as in the paper: obstacles may leave. A stroke and the way back
 are two motions; `held in any way` also counts targets that were lifted together with another object.
 """
@@ -79,7 +79,8 @@ def main() -> None:
     rows = [HEADER]
     for object_set in arguments.sets:
         for policy in arguments.policies:
-            name = f"{Path(object_set).name}-{policy.replace('/', '_').replace(':', '-')}-{arguments.episodes}.json"
+            of_set = object_set if object_set in ("seen", "unseen") else f"folder-{Path(object_set).name}"
+            name = f"{of_set}-{policy.replace('/', '_').replace(':', '-')}-{arguments.episodes}.json"
             path = arguments.out / name
             if not path.exists():
                 io.write_json(path, evaluate(policy, object_set, arguments.episodes, arguments.threads))
