@@ -2,9 +2,10 @@
 
     python benchmarks/table1.py --out runs/table1 [--sets seen unseen DIR] [--policies ppg target-ppg pretrained ...]
 
-A set is `seen`, `unseen`, or a folder of meshes, whose files begin with `folder-` and its name. Every evaluation is a file in --out; those that are there are not made
-again, so that a run that was stopped goes on. Counted as in the paper: obstacles may leave. A stroke and the way back
-are two motions; `held in any way` also counts targets that were lifted together with another object.
+A set is `seen`, `unseen`, or a folder of meshes, whose files begin with `folder-` and its name. Every evaluation is a
+file in --out; those that are there are not made again, so that a run that was stopped goes on. Counted as in the paper:
+obstacles may leave. A stroke and the way back are
+two motions; `held in any way` also counts targets that were lifted together with another object.
 """
 
 import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
