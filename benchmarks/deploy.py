@@ -180,16 +180,16 @@ def play(bundle: Any, *, scenes: range) -> dict[str, Any]:
             if decision.push is not None and not ended:
                 count["decisions"] += 1
                 same = decision.push.action == int(allowed.argmax())
-                tie = allowed.max() - allowed.reshape(-1)[decision.push.action] <= TIE
-                count["same_push"] += int(same or tie)
-                if not (same or tie):
+                given_up = float(allowed.max() - allowed.reshape(-1)[decision.push.action])
+                same = same or given_up <= TIE
+                count["same_push"] += int(same)
+                if not same:
                     quantized = np.asarray(grid.quantize_height(np.clip(looked.maps.height_m, 0, 0.3)))
-                    given_up = allowed.max() - allowed.reshape(-1)[decision.push.action]
                     different.append(
                         {
                             "scene": index,
                             "push": pushes,
-                            "q_given_up": round(float(given_up), 4),
+                            "q_given_up": round(given_up, 4),
                             "cells": int((quantized != np.asarray(obs.height)).sum()),
                             "labels": int((looked.maps.labels != labels).sum()),
                             "farthest_mm": round(1e3 * float(np.abs(looked.maps.height_m - seen).max()), 1),

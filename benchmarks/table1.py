@@ -4,8 +4,8 @@
 
 A set is `seen`, `unseen`, or a folder of meshes, whose files begin with `folder-` and its name. Every evaluation is a
 file in --out; those that are there are not made again, so that a run that was stopped goes on. Counted as in the paper:
-obstacles may leave. A stroke and the way back are
-two motions; `held in any way` also counts targets that were lifted together with another object.
+obstacles may leave. A stroke and the way back are two motions; `held in any way` also counts targets that were lifted
+together with another object.
 """
 
 import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
@@ -22,6 +22,8 @@ from pregrasp_jax.evaluation import load_evaluation
 from pregrasp_jax.evaluation.player import make_player, run_evaluation
 from pregrasp_jax.policies.ppg import STROKE_SCRIPTS
 
+BUILTIN = ("seen", "unseen")
+
 POLICIES = ("ppg", "target-ppg", "pretrained", "strokes", "target-strokes")
 
 HEADER = ("set", "policy", "success", "held in any way", "attempts", "motions", "s per success", "most failures")
@@ -29,8 +31,7 @@ HEADER = ("set", "policy", "success", "held in any way", "attempts", "motions", 
 
 def evaluate(policy: str, object_set: str, episodes: int, threads: int) -> dict[str, Any]:
     """Return the evaluation of a policy on a set."""
-    builtin = object_set in ("seen", "unseen")
-    assets = AssetsConfig(object_set=object_set) if builtin else AssetsConfig(object_dir=object_set)  # pyright: ignore[reportArgumentType]
+    assets = AssetsConfig(object_set=object_set) if object_set in BUILTIN else AssetsConfig(object_dir=object_set)  # pyright: ignore[reportArgumentType]
     strokes = {"robot": "barrett", "primitive": "push_grasp"} if policy in STROKE_SCRIPTS else {}
     request = EvaluationConfig(
         policy=policy,
@@ -72,7 +73,7 @@ def main() -> None:
     """Evaluate what is missing, and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the evaluations")
-    parser.add_argument("--sets", nargs="+", default=["seen", "unseen"], help="seen, unseen, or folders of meshes")
+    parser.add_argument("--sets", nargs="+", default=BUILTIN, help="seen, unseen, or folders of meshes")
     parser.add_argument("--policies", nargs="+", default=POLICIES, help="as for pregrasp-jax evaluate")
     parser.add_argument("--episodes", type=int, default=200, help="test scenes, from the first")
     parser.add_argument("--threads", type=int, default=0, help="of physics; 0 takes every core")
@@ -80,7 +81,7 @@ def main() -> None:
     rows = [HEADER]
     for object_set in arguments.sets:
         for policy in arguments.policies:
-            of_set = object_set if object_set in ("seen", "unseen") else f"folder-{Path(object_set).name}"
+            of_set = object_set if object_set in BUILTIN else f"folder-{Path(object_set).name}"
             name = f"{of_set}-{policy.replace('/', '_').replace(':', '-')}-{arguments.episodes}.json"
             path = arguments.out / name
             if not path.exists():

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from pregrasp_jax import yaml_file
-from pregrasp_jax.settings import from_dict
+from pregrasp_jax.settings import check_ranges, from_dict
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,10 +60,7 @@ class Sensor:
         Raises:
             ValueError: a value is out of range; the line says which, and what is allowed.
         """
-        for name, (low, high) in _RANGES.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ValueError(f"{name} = {value} is out of range; allowed is {low:g} to {high:g}")
+        check_ranges(self, _RANGES)
         return self
 
     @property

@@ -112,27 +112,18 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(collection, tmp_path):
 
 
 def test_the_preset_collects_grasps_learns_from_them_and_is_evaluated(tmp_path, capfd):
-    scenes = [
-        "--scene.train-scenes",
-        "4",
-        "--scene.validation-scenes",
-        "2",
-        "--train.num-envs",
-        "4",
-        "--physics.threads",
-        "1",
-    ]
-    strokes = [
-        "--strokes.positives",
-        "4",
-        "--strokes.width",
-        "0.03125",
-        "--strokes.epochs",
-        "1",
-        "--strokes.batch-size",
-        "2",
-    ]
-    assert main(["train", "ppg", "--run-dir", str(tmp_path / "run"), *scenes, *strokes]) == 0
+    settings = {
+        "scene.train-scenes": 4,
+        "scene.validation-scenes": 2,
+        "train.num-envs": 4,
+        "physics.threads": 1,
+        "strokes.positives": 4,
+        "strokes.width": 1 / 32,
+        "strokes.epochs": 1,
+        "strokes.batch-size": 2,
+    }
+    options = [word for name, value in settings.items() for word in (f"--{name}", str(value))]
+    assert main(["train", "ppg", "--run-dir", str(tmp_path / "run"), *options]) == 0
     assert "done: 4 stable grasps learnt from" in capfd.readouterr().out
     policy = f"target-ppg:{tmp_path / 'run'}"
     assert main(["evaluate", "--policy", policy, "--episodes", "2", "--scene.test-scenes", "2"]) == 0

@@ -151,3 +151,11 @@ def test_a_browser_shows_the_page_without_error(
         **{"wide": [], "pictures": 80, "loaded": 80, "small": 0, "paper": paper}
     }
     assert "CONSOLE" not in result.stderr
+
+
+def test_the_page_of_a_run_of_strokes_speaks_of_strokes(tmp_path: Path) -> None:
+    for name, method in (("first", "q_learning"), ("strokes", "imitation")):
+        run_dir = write_run(tmp_path / name, train=to_dict(PRESETS["ci"].train) | {"method": method})
+        text = write_report(read_run(run_dir), films=make_films()).read_text()
+        assert ("Before every stroke" in text) == ("strokes and updates" in text) == (method == "imitation")
+        assert ("Before every push" in text) == ("plays the averaged network" in text) == (method == "q_learning")

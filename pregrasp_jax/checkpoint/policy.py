@@ -107,10 +107,8 @@ def _read_policy(path: Path) -> TrainedPolicy:
     if _checksum(arrays, metadata) != metadata["checksum"]:
         raise DamagedFileError(f"{path} is altered (checksum differs)")
     try:
-        config, evaluation = (
-            Config.from_dict(json.loads(metadata["config"])).validate(),
-            json.loads(metadata["evaluation"]),
-        )
+        config = Config.from_dict(json.loads(metadata["config"])).validate()
+        evaluation = json.loads(metadata["evaluation"])
     except ValueError as error:
         raise ValueError(f"{path} was written by another version of this package: {error}") from None
     return TrainedPolicy(trees.nest(arrays), config, evaluation, path)

@@ -27,6 +27,12 @@ _FILM_KEY = (
     "ahead of the hand; the arrow is the push that was chosen."
 )
 
+_STROKES_KEY = (
+    "Before every stroke: the camera view, what the policy sees (height; Target-PPG sees the segmentation too), and "
+    "its values for some of the headings, among them the chosen one. They are drawn where the stroke may begin; the arrow "
+    "is the stroke that was chosen."
+)
+
 
 def write_report(
     run: RunRecord,
@@ -55,7 +61,8 @@ def write_report(
         Where it lies.
     """
     path = path or run.path / REPORT
-    episodes = _episodes(films, films_note, policy) if films else kept_episodes(path, policy)
+    key = _STROKES_KEY if _of_strokes(run) else _FILM_KEY
+    episodes = _episodes(films, films_note, policy, key=key) if films else kept_episodes(path, policy)
     io.write_bytes(path, build_page(run, documents, episodes, outdated=outdated).encode())
     return path
 
@@ -137,10 +144,11 @@ def _header(run: RunRecord) -> Iterator[Markup]:
         facts.append(("best validation success", results.percent(run.best["success_rate"]), between))
         if is_number(run.best.get("env_steps")):
             facts.append(("reached after", f"{run.best['env_steps']:,} pushes", ""))
-    for metric, title, unit in (("env_steps", "trained for", "pushes"), ("gradient_steps", "updates", "")):
+    steps = "strokes and updates" if _of_strokes(run) else "pushes"
+    for metric, title, unit in (("env_steps", "trained for", steps), ("gradient_steps", "updates", "")):
         if (value := run.last(metric)) is not None:
-            small = f"{run.last('episodes') or 0:,} episodes" if metric == "env_steps" else ""
-            facts.append((title, f"{value:,} {unit}", small))
+            episodes = run.last("episodes") if metric == "env_steps" else None
+            facts.append((title, f"{value:,} {unit}", "" if episodes is None else f"{episodes:,} episodes"))
     if (seconds := run.last(SECONDS)) is not None:
         facts.append(("training time", charts.duration(seconds), "without start-up"))
     fact_list = [
@@ -148,6 +156,10 @@ def _header(run: RunRecord) -> Iterator[Markup]:
         for title, value, small in facts
     ]
     yield element("dl", *fact_list, class_="facts")
+
+
+def _of_strokes(run: RunRecord) -> bool:
+    return run.setting("train", "method", "q_learning") == "imitation"
 
 
 def _results(run: RunRecord, documents: Sequence[dict[str, Any]]) -> Iterator[Markup]:
@@ -171,7 +183,11 @@ def _results(run: RunRecord, documents: Sequence[dict[str, Any]]) -> Iterator[Ma
 
 def _learning(run: RunRecord) -> Iterator[Markup]:
     if figures := charts.learning_figures(run):
-        text = "Validation plays the averaged network greedily on fixed scenes, grasp included; training explores."
+        text = (
+            "Validation is on stable grasps that are not learned from."
+            if _of_strokes(run)
+            else "Validation plays the averaged network greedily on fixed scenes, grasp included; training explores."
+        )
         yield element("p", text, class_="soft")
     yield from _figures(figures)
 
@@ -198,13 +214,13 @@ def _how_to_film(run: RunRecord) -> Iterator[Markup]:
     yield element("pre", code(f"pregrasp-jax report {shlex.quote(str(run.path))}"))
 
 
-def _episodes(films: Sequence[Film], note: str, policy: str | None = None) -> Markup:
-    """Return the section of films, marked with the policy that they are of if a later page may keep it."""
+def _episodes(films: Sequence[Film], note: str, policy: str | None = None, *, key: str = _FILM_KEY) -> Markup:
+    """Return the section of films, which `key` explains, marked with their policy if a later page may keep it."""
     ramps = [
         element("span", class_=f"ramp {name}", role="img", aria_label="dark to bright") for name in ("height", "q")
     ]
     legend = ["height 0 ", ramps[0], " 0.30 m; Q-values lowest ", ramps[1], " highest (numbers under each map)"]
-    texts = [element("p", _FILM_KEY, class_="soft"), element("p", *legend, class_="soft"), element("p", note)]
+    texts = [element("p", key, class_="soft"), element("p", *legend, class_="soft"), element("p", note)]
     return section("Episodes", *texts, *film_strips(films), policy=policy)
 
 
