@@ -21,6 +21,9 @@ Method = Literal["q_learning", "imitation"]
 FreeSpace = Literal["feasible", "cluster"]
 Normalization = Literal["none", "batch"]
 
+STYLES = ("ppg", "target-ppg")
+"""Ways of playing a policy of strokes, and names of the one that ships."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class AssetsConfig:

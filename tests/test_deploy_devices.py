@@ -1,16 +1,20 @@
 """Devices: poses, calibrations, the guard; the real UR client and the RG2 against what stands for them."""
 
 import asyncio
+import os
 import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from bundles import small_bundle
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from pregrasp_jax.deploy.build import make_decider
@@ -19,6 +23,7 @@ from pregrasp_jax.deploy.cell import Cell, camera_of, read_cell
 from pregrasp_jax.deploy.decision import Decider, Push
 from pregrasp_jax.deploy.devices import DeviceError
 from pregrasp_jax.deploy.drivers.dry import DryArm, DryGripper
+from pregrasp_jax.deploy.files import FileSegmenter, FileSource
 from pregrasp_jax.deploy.guard import ArmState, Limits, refuse_motion, refuse_pose, refuse_state
 from pregrasp_jax.deploy.poses import grasp_point, matrix_of_vector, on_table, read_pose, rotation_vector, tcp_pose
 from pregrasp_jax.robot import kinematics
@@ -213,7 +218,9 @@ def test_motions_that_may_not_be():
 
 def test_a_dry_cell_says_what_it_would_send(decider: Decider):
     said: list[str] = []
-    arm = DryArm(decider.body.arm, Limits(), np.array(decider.contract.robot.home), speed=0.1, say=said.append)
+    arm = DryArm(
+        decider.body.arm, Limits(), np.array(decider.contract.robot.home), speed=0.1, acceleration=0.5, say=said.append
+    )
     gripper, push = DryGripper(say=said.append), push_to(decider)
     gripper.move(0.0)
     arm.push(push)
@@ -221,7 +228,7 @@ def test_a_dry_cell_says_what_it_would_send(decider: Decider):
     assert not gripper.grasp()
     assert said[0] == "dry: gripper to 0%" and said[1].startswith("dry: moveL([") and "0.1 m/s" in said[1]
     with pytest.raises(DeviceError, match="speed"):
-        DryArm(decider.body.arm, Limits(), np.zeros(6), speed=0.5).push(push)
+        DryArm(decider.body.arm, Limits(), np.zeros(6), speed=0.5, acceleration=0.5).push(push)
 
 
 class Controller:
@@ -287,6 +294,9 @@ def test_a_push_that_goes_wrong_ends_in_one_line(decider: Decider, controller: C
         with pytest.raises(DeviceError, match=said) as stopped:
             arm.push(push_to(decider))
         assert "\n" not in str(stopped.value)
+        if said.startswith("pushed"):
+            places = [arm.state().tcp_pose for _ in range(2) if time.sleep(0.3) is None]
+            np.testing.assert_allclose(places[0], places[1], atol=1e-3, err_msg="it goes on")
     finally:
         arm.close()
 
@@ -330,10 +340,11 @@ class Gripper:
         if values:
             self.written.append(list(values))
             self.moved = time.monotonic()
-            registers[0x010B] = int(max(values[1], self.object))
+            registers[0x0113] = int(max(values[1], self.object))
         elif function == 3 and address == 0x010C:
-            busy = self.forever or time.monotonic() - self.moved < 0.1
-            held = self.object > 0 and bool(self.written) and self.written[-1][1] < self.object
+            since = time.monotonic() - self.moved
+            busy = self.forever or 0.06 < since < 0.16  # it needs a moment to begin
+            held = since > 0.1 and self.object > 0 and bool(self.written) and self.written[-1][1] < self.object
             registers[0x010C] = self.extra | (1 if busy and self.written else 0) | (2 if held and not busy else 0)
 
     def _serve(self) -> None:
@@ -389,6 +400,37 @@ def test_a_gripper_that_must_not_go_on():
     with pytest.raises(DeviceError, match="still busy"):
         stuck.connect(clock=lambda: float(next(ticks))).move(0.5)
     assert stuck.written[-1][2] == 8, "it is told to stop"
+
+
+def test_pictures_are_taken_after_they_are_asked_for_and_masks_are_of_them(tmp_path):
+    depth, ids = tmp_path / "depth.npy", tmp_path / "ids.png"
+    np.save(depth, np.ones((4, 4), np.float32))
+    Image.fromarray(np.ones((4, 4), np.uint8)).save(ids)
+    assert FileSource(depth, fresh=False).capture()[2] == depth.stat().st_mtime
+    source = FileSource(depth, fresh=True, patience_s=0.5)
+    with pytest.raises(DeviceError, match=r"no new depth image in .*depth\.npy for 0\.5 s"):
+        source.capture()
+    np.save(tmp_path / "next.npy", np.full((4, 4), 2, np.float32))
+
+    def write() -> None:
+        (tmp_path / "next.npy").touch()
+        (tmp_path / "next.npy").replace(depth)
+
+    threading.Timer(0.2, write).start()
+    image, _, taken = source.capture()
+    assert image[0, 0] == 2
+    segmenter = FileSegmenter(ids, min_score=0.5, patience_s=0.5)
+    frame: Any = SimpleNamespace(time_s=taken)
+    with pytest.raises(DeviceError, match=r"no new file of masks in .*ids\.png"):
+        segmenter.segment(frame)
+    os.utime(ids, (taken, taken))
+    assert len(segmenter.segment(frame).masks) == 1
+
+
+@pytest.mark.parametrize("box", [((float("nan"), 0, 0), (1, 1, 1)), ((-9, -9, -9), (1, 1, 1)), ((0, 0, 0), (1, 0, 1))])
+def test_a_box_that_holds_nothing_back_is_refused(box):
+    with pytest.raises(ValueError, match="are no box; allowed is"):
+        Limits(low_m=box[0], high_m=box[1])
 
 
 def test_a_command_line_without_a_cell_moves_nothing(capsys):

@@ -148,6 +148,14 @@ def test_a_demonstration_that_is_turned_still_looks_at_the_same_thing(seed, turn
     assert same or reflected
 
 
+def test_all_quarter_turns_and_reflections_occur():
+    height = jnp.zeros((100, 100)).at[10, 30].set(0.1)
+    shown = Demonstration(height, jnp.int32(10), jnp.int32(30), jnp.int32(1), jnp.float32(0.5))
+    found = jax.vmap(turned_at_random, (0, None))(jax.random.split(jax.random.key(0), 64), shown)
+    assert set(np.asarray(found.heading).tolist()) == {1, 5, 9, 13, 15, 11, 7, 3}, "+1 turned, -1 reflected and turned"
+    assert (np.asarray(found.height)[np.arange(64), found.row, found.col] > 0).all()
+
+
 def test_the_window_is_what_lies_ahead():
     height = np.zeros((100, 100), np.float32)
     height[60, 40:45] = 0.07  # 10 to 14 cells ahead of (60, 30) along +x; 20 behind (60, 60) along -x ...

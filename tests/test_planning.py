@@ -172,6 +172,7 @@ def test_chances_rise_with_values():
     ("arguments", "line"),
     [
         (["--policy", "clear", "--plan", "True"], "plan = True: policy clear is a script; allowed is pretrained"),
+        (["--policy", "strokes", "--plan", "True"], "plan = True: policy strokes is a script; allowed is pretrained"),
         (["--policy", "pretrained", "--planning.depth", "1"], "planning.* is set, but plan = False"),
         (
             ["--policy", "pretrained", "--plan", "True", "--planning.variants", "0"],

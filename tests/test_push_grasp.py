@@ -181,7 +181,6 @@ def outcome(**changes):
         collided=jnp.bool_(False),
         held=none,
         stable=none,
-        gone=none,
         toppled=none,
         off_table=none,
         final=jnp.bool_(False),

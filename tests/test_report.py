@@ -9,7 +9,7 @@ from report_files import ROWS, evaluation_row, log_row, run_main, write_evaluati
 from pregrasp_jax.config import PRESETS
 from pregrasp_jax.report import build_page, load_evaluations, read_run
 from pregrasp_jax.report.charts import duration, failure_figures, learning_figures, time_figures
-from pregrasp_jax.report.results import SCRIPTS, missing
+from pregrasp_jax.report.results import SCRIPTS, is_of_run, missing
 from pregrasp_jax.settings import to_dict
 
 
@@ -21,6 +21,12 @@ def run_dir(tmp_path: Path) -> Path:
 def _texts(page: str) -> list[str]:
     """Return the text of every table cell."""
     return [re.sub(r"<[^>]*>", "", cell) for cell in re.findall(r"<t[hd]\b[^>]*>(.*?)</t[hd]>", page, re.S)]
+
+
+def test_a_run_is_not_what_ships_under_the_same_name(tmp_path: Path) -> None:
+    run = read_run(write_run(tmp_path / "ppg"))
+    policies = ("elsewhere/ppg", "target-ppg:elsewhere/ppg", "ppg", "target-ppg", "strokes")
+    assert [is_of_run(run, {"policy": policy}) for policy in policies] == [True, True, False, False, False]
 
 
 # --- results ---------------------------------------------------------------------------------------------------------

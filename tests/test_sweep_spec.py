@@ -243,6 +243,7 @@ def test_cores_memory_and_gpus_are_shared_out(monkeypatch):
     assert shared(cores=1, memory=4e9) == [((3,), ()), ((4,), ())]
     assert [gpus for _, gpus in shared(cores=1, gpu=0.5)] == [("0",), ("1",), ("0",), ("1",)]
     assert [gpus for _, gpus in shared(cores=1, gpu=2.0)] == [("0", "1")]
+    assert [gpus for _, gpus in shared(cores=1, gpu=0.4)] == [("0",), ("1",), ("0",), ("1",)], "three are too many"
     assert len(shared(parallel=3)) == 3
     for options, said in (
         ({"parallel": 6}, r"6 trials at a time do not fit: there are 5 cores of which a trial takes 1; .* at most 5"),

@@ -56,7 +56,7 @@ def verify(bundle: Path, /, *, formats: tuple[str, ...] = (), tolerance: float =
     findings = find(read_bundle(bundle), formats=formats, tolerance=tolerance)
     for finding in findings:
         print(finding.line())
-    if not any(finding.passed for finding in findings):
+    if all(finding.passed is None for finding in findings if finding.name != "heightmaps"):
         print("nothing could be checked here")
         return 1
     return int(any(finding.passed is False for finding in findings))

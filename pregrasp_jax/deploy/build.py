@@ -100,7 +100,9 @@ def make_station(
     view = make_view(cell, decider, folder)
     if not cell.camera.depth:
         raise ValueError("camera.depth is missing in cell.yaml; allowed is the file that the camera's driver writes")
-    source = FileSource(folder / cell.camera.depth, folder / cell.camera.color if cell.camera.color else None)
+    source = FileSource(
+        folder / cell.camera.depth, folder / cell.camera.color if cell.camera.color else None, fresh=arm != "dry"
+    )
     hand = _gripper(cell, gripper, say)
     try:
         return Station(
@@ -126,7 +128,9 @@ def _arm(cell: Cell, decider: Decider, kind: ArmKind, say: Say) -> ArmDriver:
     contract, limits = decider.contract, cell.robot.limits
     speed = contract.action.push_speed_m_s if cell.robot.speed_m_s is None else cell.robot.speed_m_s
     if kind == "dry":
-        return DryArm(decider.body.arm, limits, np.array(contract.robot.home), speed=speed, say=say)
+        acceleration = cell.robot.acceleration_m_s2
+        home = np.array(contract.robot.home)
+        return DryArm(decider.body.arm, limits, home, speed=speed, acceleration=acceleration, say=say)
     from pregrasp_jax.deploy.drivers.ur import UrArm
 
     return UrArm(

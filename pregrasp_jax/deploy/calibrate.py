@@ -43,31 +43,43 @@ class CalibrationReport(NamedTuple):
     reachable: float
     deviation_m: np.ndarray
 
-    def lines(self) -> list[str]:
-        """Return it as text, each line with what is good."""
+    def _findings(self) -> list[tuple[str, str, bool]]:
+        """Return (what was measured, what is good, whether it is)."""
+        tilt = f"{self.tilt_deg:.2f} degrees, {self.slope_x_deg:+.2f} along x, {self.slope_y_deg:+.2f} along y"
         return [
-            f"depth on the workspace   {self.seen:.1%} of its pixels (good: above 90 %)",
-            f"on the table             {self.on_table:.1%} of these within 20 mm of the plane (good: above 60 %)",
-            f"height of the table      {self.offset_m * 1e3:+.1f} mm (good: within 3 mm; table.height_m moves it)",
-            f"tilt                     {self.tilt_deg:.2f} degrees, {self.slope_x_deg:+.2f} along x, "
-            f"{self.slope_y_deg:+.2f} along y (good: below 0.5)",
-            f"noise                    {self.noise_m * 1e3:.1f} mm (good: below 5 mm)",
-            f"resolution               {self.pixels_per_cell:.1f} pixels per cell (good: above 4)",
-            f"reach                    {self.reachable:.0%} of the pushes from the start (good: 100 %)",
+            (f"depth on the workspace   {self.seen:.1%} of its pixels", "above 90 %", self.seen > 0.9),
+            (
+                f"on the table             {self.on_table:.1%} of these within 20 mm of the plane",
+                "above 60 %",
+                self.on_table > 0.6,
+            ),
+            (
+                f"height of the table      {self.offset_m * 1e3:+.1f} mm",
+                "within 3 mm; table.height_m moves it",
+                abs(self.offset_m) < 0.003,
+            ),
+            (f"tilt                     {tilt}", "below 0.5", self.tilt_deg < 0.5),
+            (f"noise                    {self.noise_m * 1e3:.1f} mm", "below 5 mm", self.noise_m < 0.005),
+            (
+                f"resolution               {self.pixels_per_cell:.1f} pixels per cell",
+                "above 4",
+                self.pixels_per_cell > 4,
+            ),
+            (
+                f"reach                    {self.reachable:.0%} of the pushes from the start",
+                "100 %",
+                self.reachable == 1,
+            ),
         ]
+
+    def lines(self) -> list[str]:
+        """Return it as text, each line with whether it is good."""
+        return [f"{found} ({'good' if fine else 'NOT GOOD'}: {wanted})" for found, wanted, fine in self._findings()]
 
     @property
     def good(self) -> bool:
         """Whether all numbers are."""
-        return (
-            self.seen > 0.9
-            and self.on_table > 0.6
-            and abs(self.offset_m) < 0.003
-            and self.tilt_deg < 0.5
-            and self.noise_m < 0.005
-            and self.pixels_per_cell > 4
-            and self.reachable == 1
-        )
+        return all(fine for _, _, fine in self._findings())
 
 
 def check_calibration(depth_m: np.ndarray, *, camera: PinholeCamera, crop: Crop, decider: Decider) -> CalibrationReport:

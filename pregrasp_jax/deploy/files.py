@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,31 +11,29 @@ from PIL import Image
 
 from pregrasp_jax.deploy.devices import DeviceError, Frame
 from pregrasp_jax.deploy.masks import Masks, from_mask_rcnn
+from pregrasp_jax.messages import one_line
 
 
 class FileSource:
     """A depth camera whose driver keeps writing one file, whole (to another name, then renamed)."""
 
-    def __init__(self, depth: Path, color: Path | None = None, *, patience_s: float = 5.0):
+    def __init__(self, depth: Path, color: Path | None = None, *, fresh: bool, patience_s: float = 5.0):
         """Remember the files; they are read by `capture`.
 
         Args:
             depth: .npy, or .png of 16 bits.
             color: .png; None without one.
-            patience_s: how long a newer image than the last one is waited for.
+            fresh: an image must be written after it is asked for: the arm may have moved before. Otherwise any that has
+                not been read will do.
+            patience_s: how long such an image is waited for.
         """
-        self._depth, self._color, self._patience, self._last = depth, color, patience_s, 0.0
+        self._depth, self._color, self._patience = depth, color, patience_s
+        self._fresh, self._last = fresh, 0.0
 
     def capture(self) -> tuple[np.ndarray, np.ndarray | None, float]:
         """Return the newest image; see `ImageSource.capture`."""
-        begun = time.monotonic()
-        while not (self._depth.is_file() and self._depth.stat().st_mtime > self._last):
-            if time.monotonic() - begun > self._patience:
-                raise DeviceError(
-                    f"no new depth image in {self._depth} for {self._patience:g} s; is its writer running?"
-                )
-            time.sleep(0.02)
-        self._last = self._depth.stat().st_mtime
+        after = time.time() if self._fresh else self._last
+        self._last = _wait(self._depth, lambda written: written > after, "depth image", self._patience)
         color = read_image(self._color) if self._color else None
         return read_depth(self._depth), color, self._last
 
@@ -42,13 +41,23 @@ class FileSource:
 class FileSegmenter:
     """Masks that a network writes beside the depth image."""
 
-    def __init__(self, path: Path, *, min_score: float):
-        self._path, self._min_score = path, min_score
+    def __init__(self, path: Path, *, min_score: float, patience_s: float = 5.0):
+        self._path, self._min_score, self._patience = path, min_score, patience_s
 
     def segment(self, frame: Frame) -> Masks:
-        """Return what the file holds; see `Segmenter.segment`."""
-        del frame
+        """Return what the file holds once it is no older than the image; see `Segmenter.segment`."""
+        _wait(self._path, lambda written: written >= frame.time_s, "file of masks", self._patience)
         return read_masks(self._path, min_score=self._min_score)
+
+
+def _wait(path: Path, is_new: Callable[[float], bool], what: str, patience_s: float) -> float:
+    """Wait until a file has been written anew, and return when that was, s since 1970."""
+    begun = time.monotonic()
+    while not (path.is_file() and is_new(written := path.stat().st_mtime)):
+        if time.monotonic() - begun > patience_s:
+            raise DeviceError(f"no new {what} in {path} for {patience_s:g} s; is its writer running?")
+        time.sleep(0.02)
+    return written
 
 
 def read_depth(path: Path) -> np.ndarray:
@@ -77,7 +86,7 @@ def read_image(path: Path) -> np.ndarray:
         with Image.open(path) as image:
             return np.array(image)
     except (OSError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read as a picture ({' '.join(str(error).split())})") from None
+        raise ValueError(f"{path} cannot be read as a picture ({one_line(error)})") from None
 
 
 def read_masks(path: Path, *, min_score: float = 0.5) -> Masks:
@@ -112,4 +121,4 @@ def _load(path: Path) -> Any:
         with loaded:
             return {name: loaded[name] for name in loaded.files}
     except (OSError, ValueError, EOFError) as error:
-        raise ValueError(f"{path} cannot be read ({' '.join(str(error).split())})") from None
+        raise ValueError(f"{path} cannot be read ({one_line(error)})") from None

@@ -33,6 +33,14 @@ class Limits:
     age_s: float = 0.1
     """Oldest data that is acted upon."""
 
+    def __post_init__(self):
+        """Refuse a box that is none, or none that holds: comparisons with NaN let everything pass."""
+        if not all(-1 <= low < high <= 1 for low, high in zip(self.low_m, self.high_m, strict=True)):
+            raise ValueError(
+                f"robot.limits.low_m = {list(self.low_m)} and high_m = {list(self.high_m)} are no box; allowed is each "
+                "number of the first below that of the second, all within -1 to 1 m"
+            )
+
 
 @dataclass(frozen=True, kw_only=True)
 class ArmState:

@@ -16,6 +16,7 @@ from pregrasp_jax.deploy.contract import Contract
 from pregrasp_jax.deploy.decision import Decision
 from pregrasp_jax.deploy.devices import Frame
 from pregrasp_jax.deploy.projection import Maps
+from pregrasp_jax.messages import one_line
 from pregrasp_jax.spaces import motion
 
 FORMAT = "pregrasp_jax decision 1"
@@ -128,6 +129,4 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         with np.load(path.with_suffix(".npz"), allow_pickle=False) as file:
             return about, {name: file[name] for name in file.files}
     except Exception as error:  # whatever is wrong with the files
-        raise ValueError(
-            f"{path} cannot be read ({' '.join(str(error).split())}); allowed is a `deploy --log`"
-        ) from None
+        raise ValueError(f"{path} cannot be read ({one_line(error)}); allowed is a `deploy --log`") from None

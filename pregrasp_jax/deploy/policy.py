@@ -7,6 +7,7 @@ import numpy as np
 
 from pregrasp_jax.deploy.bundle import Bundle
 from pregrasp_jax.deploy.contract import ONNX, Tensor
+from pregrasp_jax.messages import one_line
 
 Values = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """(height_m [B, H, W] float32, labels [B, H, W] uint8, p1_m [B, 2] float32) -> q [B, H, W, K] float32."""
@@ -34,7 +35,7 @@ def load_values(bundle: Bundle, *, threads: int = 1) -> Values:
     try:
         session = onnxruntime.InferenceSession(bundle.files[ONNX], options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own classes
-        raise ValueError(f"{bundle.folder / ONNX} cannot be loaded ({' '.join(str(error).split())})") from None
+        raise ValueError(f"{bundle.folder / ONNX} cannot be loaded ({one_line(error)})") from None
     tensors = bundle.contract.tensors
     wanted = [(tensor.name, tensor.dtype) for tensor in tensors]
     kinds = {"tensor(float)": "float32", "tensor(uint8)": "uint8"}

@@ -11,6 +11,7 @@ import numpy as np
 from pregrasp_jax import yaml_file
 from pregrasp_jax.deploy.camera import refuse_pose
 from pregrasp_jax.geometry import quat_to_matrix
+from pregrasp_jax.messages import one_line
 from pregrasp_jax.robot import kinematics
 from pregrasp_jax.robot.following import Body
 from pregrasp_jax.robot.kinematics import Arm
@@ -92,7 +93,7 @@ def read_pose(path: Path) -> np.ndarray:
         try:
             matrix = np.asarray(readers[path.suffix](), float)
         except (OSError, ValueError, TypeError) as error:
-            raise ValueError(f"{path} cannot be read ({' '.join(str(error).split())}); {wanted}") from None
+            raise ValueError(f"{path} cannot be read ({one_line(error)}); {wanted}") from None
     refuse_pose(matrix, what=f"{path}: the pose")
     return matrix
 

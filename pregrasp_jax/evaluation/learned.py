@@ -16,9 +16,6 @@ from pregrasp_jax.policies.scripts import Policy
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.task.env import Env
 
-STYLES = ("ppg", "target-ppg")
-"""Ways of playing a policy of strokes."""
-
 
 class Learned(NamedTuple):
     """A trained policy in its environment.

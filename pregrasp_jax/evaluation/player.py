@@ -10,9 +10,10 @@ from typing import Any
 
 import jax
 
-from pregrasp_jax.checkpoint import load_policy
-from pregrasp_jax.checkpoint.policy import PPG, SHIPPED
+from pregrasp_jax.checkpoint import TrainedPolicy, load_policy
+from pregrasp_jax.checkpoint.policy import PPG
 from pregrasp_jax.config import (
+    STYLES,
     Config,
     EvaluationConfig,
     PlaceConfig,
@@ -22,7 +23,6 @@ from pregrasp_jax.config import (
     with_absolute_paths,
 )
 from pregrasp_jax.evaluation import EpisodeCallback, Evaluator, evaluation_document, learned
-from pregrasp_jax.evaluation.learned import STYLES
 from pregrasp_jax.machine import announced_compilation
 from pregrasp_jax.planning.planner import Planner
 from pregrasp_jax.policies import scripts
@@ -73,7 +73,7 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     """
     prepare()
     trained = _load(request.policy)
-    _check_planning(request)
+    _check_planning(request, trained)
     config = _environment_config(request, Config() if trained is None else trained.config)
     if trained is not None:
         _refuse_other_hand(config, trained.config)
@@ -147,25 +147,34 @@ def _named(spec: str) -> tuple[str, str]:
     return (folder, style) if colon and style in STYLES else (spec, "")
 
 
-def _check_planning(request: EvaluationConfig) -> None:
+def _check_planning(request: EvaluationConfig, trained: TrainedPolicy | None) -> None:
     """Refuse a search that has no network to ask, and settings of one that is not wanted."""
-    if request.plan and request.policy in scripts.SCRIPTS:
+    if request.plan and trained is None:
         raise ValueError(f"plan = True: policy {request.policy} is a script; allowed is pretrained, or a run folder")
     if not request.plan and request.planning != PlanningConfig():
         raise ValueError("planning.* is set, but plan = False; allowed is plan = True with it")
     request.planning.validate()
 
 
-def _load(spec: str) -> Any:
+def _load(spec: str) -> TrainedPolicy | None:
     """Return the trained policy that `spec` names, None for a script."""
-    if spec in scripts.SCRIPTS or spec in STROKE_SCRIPTS:
-        return None
-    folder, _ = _named(spec)
-    if SHIPPED.get(folder, Path(folder)).exists():
-        return load_policy(folder)
-    shipped = [name for name in ("pretrained", *STYLES) if SHIPPED[_named(name)[0]].exists()]
-    names = ", ".join([*scripts.SCRIPTS, *STROKE_SCRIPTS, *shipped])
-    raise ValueError(f"policy {spec} does not exist; allowed: {names}, or a run folder")
+    refuse_unknown_policy(spec, key="policy")
+    return None if spec in scripts.SCRIPTS or spec in STROKE_SCRIPTS else load_policy(_named(spec)[0])
+
+
+def refuse_unknown_policy(spec: str, *, key: str) -> None:
+    """Refuse a name of a policy that is none; see `EvaluationConfig.policy`.
+
+    Args:
+        spec: the name of a script, of a policy that ships, or a folder; `STYLE:FOLDER` plays it in that style.
+        key: the setting that it was written for.
+
+    Raises:
+        ValueError: there is no such policy.
+    """
+    names = [*scripts.SCRIPTS, *STROKE_SCRIPTS, "pretrained", *STYLES]
+    if spec not in names and not Path(_named(spec)[0]).exists():
+        raise ValueError(f"{key} {spec} does not exist; allowed: {', '.join(names)}, or a run folder")
 
 
 def _environment_config(request: EvaluationConfig, trained: Config) -> Config:

@@ -76,7 +76,8 @@ def export_policy(
 
 
 def _refuse(folder: Path, formats: Sequence[str], golden: int, force: bool) -> None:
-    if unknown := sorted(set(formats) - set(FORMATS)) or not formats:
+    unknown = sorted(set(formats) - set(FORMATS))
+    if unknown or not formats:
         raise ValueError(f"formats = {unknown or 'none'} are not known; allowed are some of {', '.join(FORMATS)}")
     if not 2 <= golden <= 1000:
         raise ValueError(f"golden = {golden} is out of range; allowed is 2 to 1000")

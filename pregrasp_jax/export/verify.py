@@ -10,6 +10,7 @@ import numpy as np
 from pregrasp_jax.deploy.bundle import Bundle
 from pregrasp_jax.deploy.contract import GOLDEN, ONNX, SAFETENSORS, STABLEHLO, STABLEHLO_BATCH
 from pregrasp_jax.deploy.policy import load_values
+from pregrasp_jax.messages import one_line
 
 TIE = 2e-4
 """Values nearer than this are a tie: either push is right."""
@@ -66,7 +67,7 @@ def _find(bundle: Bundle, golden: Golden, name: str, tolerance: float) -> Findin
     try:
         q = check(bundle, golden)
     except Exception as error:  # of onnx, jax or flax; the file is whole, so this is a finding
-        return Finding(name, False, f"{file}: {type(error).__name__}: {' '.join(str(error).split())[:200]}")
+        return Finding(name, False, f"{file}: {type(error).__name__}: {one_line(error)[:200]}")
     return compare(name, q, golden, tolerance)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from pregrasp_jax.policies.strokes import squared_distance
 from pregrasp_jax.robot.base import Robot
+from pregrasp_jax.robot.region import ClosingRegion
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.task.push_grasp import APERTURE, DISTANCE, HEADINGS, PushGrasp, push_grasp
 from pregrasp_jax.types import ROBOT_ID, TABLE_ID, EnvState
@@ -116,8 +117,7 @@ def make_feasible(robot: Robot) -> FinalStroke:
             hand, swept = (jnp.where(beside, -jnp.inf, table[line]) for table in (reach, wide))
             blocked = jnp.any(seen.obstacle & (x <= swept) & ~behind)
             cut = jnp.any(seen.target & (x <= hand))
-            width = jnp.interp(x, stations, half)
-            inside = (x >= stations[0]) & (x <= stations[-1]) & (jnp.abs(y) <= width)
+            inside = ClosingRegion(stations, half, True).holds(jnp.stack([x, y], axis=-1))
             coverage = jnp.sum(seen.target & inside) / jnp.maximum(jnp.sum(seen.target), 1)
             overlap = jnp.sum(seen.obstacle & inside) * grid.HEIGHTMAP_RESOLUTION**2
             half_hand = jnp.max(jnp.where(jnp.isfinite(reach), jnp.abs(jnp.asarray(lines, jnp.float32)), 0.0))

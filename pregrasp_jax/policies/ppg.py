@@ -44,6 +44,7 @@ def greedy(function: StrokeFunction, *, mask_radius: float = 0.0) -> Choose:
         if mask_radius:
             of_target = state.obs.instance_ids == state.scene.target + 1
             near = squared_distance(of_target) <= (mask_radius / grid.HEIGHTMAP_RESOLUTION) ** 2
+            near = near | ~jnp.any(near)  # a target that is not seen is near to nothing
             values = jnp.where(near[..., None], values, -jnp.inf)
         index = jnp.argmax(values).astype(jnp.int32)
         return IndexedStroke(index, function.aperture_of(params, height, index))

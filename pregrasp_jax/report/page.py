@@ -29,8 +29,8 @@ _FILM_KEY = (
 
 _STROKES_KEY = (
     "Before every stroke: the camera view, what the policy sees (height; Target-PPG sees the segmentation too), and "
-    "its values for some of the headings, among them the chosen one. They are drawn where the stroke may begin; the arrow "
-    "is the stroke that was chosen."
+    "its values for some of the headings, among them the chosen one. They are drawn where the stroke may begin; the "
+    "arrow is the stroke that was chosen."
 )
 
 

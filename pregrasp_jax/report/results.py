@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from pregrasp_jax.config import Config, TaskConfig
+from pregrasp_jax.config import STYLES, Config, TaskConfig
 from pregrasp_jax.evaluation import load_evaluation
 from pregrasp_jax.evaluation.statistics import compare, policy_name, workspace_of
 from pregrasp_jax.report.markup import Markup, element
@@ -61,7 +61,8 @@ def load_evaluations(run: RunRecord, files: Sequence[Path] = ()) -> list[dict[st
 
 def is_of_run(run: RunRecord, document: dict[str, Any]) -> bool:
     """Return whether a run's policy was evaluated: it goes by the folder's name, wherever that was then."""
-    return document["policy"] not in BASELINES and Path(document["policy"]).name == run.name
+    of_package = (*BASELINES, "pretrained", *STYLES)
+    return document["policy"] not in of_package and Path(document["policy"]).name == run.name
 
 
 def of_run(run: RunRecord, documents: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -1,6 +1,7 @@
 """Everything that can be known to be wrong before the first trial starts, one line each."""
 
 import itertools
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -174,6 +175,9 @@ def _check_test(spec: Spec, name: str, options: Mapping[str, Any]) -> None:
             )
         section[last] = value
     checked = from_dict(values, EvaluationConfig, f"tests.{name}.")
+    meshes = checked.assets.object_dir
+    if meshes is not None and not os.path.isdir(meshes):
+        raise ValueError(f"tests.{name}.assets.object_dir = {meshes!r} is no folder; allowed is one with meshes")
     if spec.program == PROGRAM and checked.task.workspace not in (None, *WORKSPACES):
         get_workspace(checked.task.workspace)
 

@@ -90,7 +90,8 @@ def make_spec(
         chosen = {**chosen, "set": {**chosen["set"], "train.minutes": minutes or experiment.minutes}}
     tests = dict(experiment.tests)
     if object_dir is not None:
-        tests[object_dir.name] = {"assets.object_dir": str(object_dir.absolute()), "episodes": 200}
+        meshes = object_dir.resolve()
+        tests[f"folder {meshes.name}"] = {"assets.object_dir": str(meshes), "episodes": 200}
     plain = {
         **chosen,
         "seeds": list(seeds if seeds is not None else experiment.seeds),

@@ -117,7 +117,9 @@ def share_out(spec: Spec, *, parallel: int | None, memory: float) -> list[Slot]:
     if free is not None and memory:
         room[f"{free / 1e9:.1f} GB of free memory of which a trial takes {memory / 1e9:.1f}"] = int(free / memory)
     if wanted.gpu:
-        room[f"{len(gpus)} GPUs of which a trial takes {wanted.gpu:g}"] = int(len(gpus) / wanted.gpu + 1e-9)
+        room[f"{len(gpus)} GPUs of which a trial takes {wanted.gpu:g}"] = (
+            len(gpus) * int(1 / wanted.gpu + 1e-9) if wanted.gpu < 1 else len(gpus) // int(wanted.gpu)
+        )
     reason = min(room, key=lambda name: room[name])
     if room[reason] < (parallel or 1):
         raise ValueError(

@@ -1,11 +1,10 @@
 """Names that only the registries know: checked by a dry run, since they bring JAX and MuJoCo with them."""
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
+from pregrasp_jax.evaluation.player import refuse_unknown_policy
 from pregrasp_jax.messages import lookup
-from pregrasp_jax.policies.scripts import SCRIPTS
 from pregrasp_jax.robot import ROBOTS
 from pregrasp_jax.spaces.workspace import WORKSPACES
 from pregrasp_jax.sweep.checks import settings_to_check
@@ -26,10 +25,8 @@ def check_names(spec: Spec) -> None:
     for key, name in _given(spec):
         lookup(_TABLES[key], name, key=key)
     for label, variant in spec.variants.items():
-        policy = variant.policy
-        if policy is not None and policy not in (*SCRIPTS, "pretrained") and not Path(policy).exists():
-            known = ", ".join([*SCRIPTS, "pretrained"])
-            raise ValueError(f"variants.{label}.policy = {policy!r} is unknown here; allowed: {known}, or a run folder")
+        if variant.policy is not None:
+            refuse_unknown_policy(variant.policy, key=f"variants.{label}.policy")
 
 
 def _given(spec: Spec) -> Iterator[tuple[str, str]]:

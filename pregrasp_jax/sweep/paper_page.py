@@ -1,7 +1,7 @@
 """The page of an experiment: our table with intervals beside the paper's numbers, tests in pairs, curves with bands."""
 
 import datetime
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from pregrasp_jax import io
@@ -27,7 +27,7 @@ def write_paper_page(folder: SweepFolder, spec: Spec, experiment: Experiment, pa
     curves = {m.trial.id: read_metrics(folder.run(m.trial)) for row in rows for m in row.members}
     drawn = charts.curve_figures(table, curves)
     figures = section("Learning curves", element("div", *drawn, class_="charts"), *_about_curves()) if drawn else ""
-    results = section("Results", *_results(table, rows, experiment))
+    results = section("Results", *_results(table, rows, spec.tests, experiment))
     # A figure of the paper shows its curves first.
     first = [figures, results] if experiment.name.startswith("figure") else [results, figures]
     differences = [element("ul", *(element("li", sentence) for sentence in experiment.differs))]
@@ -51,8 +51,8 @@ def _header(folder: SweepFolder, spec: Spec, experiment: Experiment) -> Iterator
     yield element("p", text, class_="soft")
 
 
-def _results(table: Table, rows: list[Row], experiment: Experiment) -> Iterator[Markup]:
-    for test in experiment.tests:
+def _results(table: Table, rows: list[Row], tests: Iterable[str], experiment: Experiment) -> Iterator[Markup]:
+    for test in tests:
         yield element("h3", f"Test: {test}")
         head = element("tr", *(element("th", name, scope="col") for name in _HEADER))
         body = [_result_row(test, row, table, experiment) for row in rows]

@@ -124,7 +124,7 @@ def follow(
     """
     poses = jnp.concatenate([path.xy, path.z[:, None], jax.vmap(quat_from_yaw)(path.yaw)], axis=1)
     ctrl, code = robot.follow(joint_pos, poses, path.aperture, workspace)
-    if opening is not None:
+    if opening is not None and workspace.walls:  # the table does not ask how far fingers are open
         code = robot.follow(joint_pos, poses, opening, workspace)[1]
     first = code[jnp.argmax(code != OBSTRUCTIONS.index("none"))]
     return make_plan(ctrl, num_ctrl, seconds, first, hand).unless(num_ctrl > len(ctrl), "too_long")

@@ -28,7 +28,6 @@ class GraspOutcome(struct.PyTreeNode):
         collided: () bool, the hand touched something on its way down.
         held: [MAX_OBJECTS] bool, lifted.
         stable: [MAX_OBJECTS] bool, held alone and not by fingertips only; one object at the most.
-        gone: [MAX_OBJECTS] bool, taken away.
         toppled: [MAX_OBJECTS] bool, fallen or leaning, not lifted.
         off_table: [MAX_OBJECTS] bool, left the workspace, not lifted.
         final: () bool, as in `PushGrasp`.
@@ -39,7 +38,6 @@ class GraspOutcome(struct.PyTreeNode):
     collided: jax.Array
     held: jax.Array
     stable: jax.Array
-    gone: jax.Array
     toppled: jax.Array
     off_table: jax.Array
     final: jax.Array
@@ -78,7 +76,6 @@ def make_rules(robot: Robot, workspace: Workspace, primitive: Primitive, bank: H
             collided=touch.collided & executed,
             held=held,
             stable=held & stable(touch, tips),
-            gone=touch.gone & present & executed,
             toppled=on_table & tilted(touch.poses[2]),
             off_table=on_table & has_left(touch.poses[2], workspace),
             final=stroke.final,

@@ -108,6 +108,9 @@ class _Session:
         self.function = StrokeFunction(config.strokes, env.primitive.actions)
         self.counters = Counters()
         self.positives: Positives = blank_positives(config.strokes.positives)
+        self._losses_of = jax.jit(
+            lambda params, batch: self.function.losses(params, self._shown(batch), train=False)[0]
+        )
         self._saved_at = time.monotonic()
 
     def start(self, *, resumed: bool) -> None:
@@ -195,11 +198,10 @@ class _Session:
     def _validate(self, rows: np.ndarray) -> None:
         """Measure both networks on grasps that they have not learnt from, and keep what is better than before."""
         params, size = self.state["learner"].params, self.config.strokes.batch_size
-        total, function, shown = np.zeros(2), self.function, self._shown
-        losses_of = jax.jit(lambda params, batch: function.losses(params, shown(batch), train=False)[0])
+        total = np.zeros(2)
         for chunk in np.resize(rows, -(-len(rows) // size) * size).reshape(-1, size):
             batch = jax.tree.map(lambda leaf, chunk=chunk: leaf[chunk], self.positives)
-            total += [float(np.mean(loss)) for loss in losses_of(params, batch)]
+            total += [float(np.mean(loss)) for loss in self._losses_of(params, batch)]
         start, aperture = (total / -(-len(rows) // size)).tolist()
         losses = {"start": start, "aperture": aperture}
         best = self.counters.best
@@ -248,7 +250,7 @@ class _Session:
                 "collect/collided": counters.collided,
                 "collect/strokes_per_second": rate,
             }
-            self.folder.append_metrics({"env_steps": counters.step, **row, "time/seconds": self._total_seconds})
+            self.folder.append_metrics({"env_steps": counters.step, **row, **self._times})
 
     def _tell_learning(self, losses: Losses, num_updates: int) -> None:
         counters = self.counters
@@ -261,11 +263,12 @@ class _Session:
         )
         if counters.updates % _LOG_BATCHES == 0:
             row = {f"train/{name}_loss": loss for name, loss in named.items()}
-            self.folder.append_metrics({"env_steps": counters.step, **row, "time/seconds": self._total_seconds})
+            self.folder.append_metrics({"env_steps": counters.step, **row, **self._times})
 
     @property
-    def _total_seconds(self) -> float:
-        return sum(self.counters.seconds.values())
+    def _times(self) -> dict[str, float]:
+        seconds = self.counters.seconds
+        return {"time/seconds": sum(seconds.values()), **{f"time/{part}": spent for part, spent in seconds.items()}}
 
 
 def split(positives: Positives, written: int, config: Config) -> tuple[np.ndarray, np.ndarray]:

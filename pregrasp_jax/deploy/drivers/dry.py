@@ -14,10 +14,17 @@ class DryArm:
     """An arm that is always where it was told to go."""
 
     def __init__(
-        self, arm: Arm, limits: Limits, joints: np.ndarray, *, speed: float, say: Callable[[str], None] = print
+        self,
+        arm: Arm,
+        limits: Limits,
+        joints: np.ndarray,
+        *,
+        speed: float,
+        acceleration: float,
+        say: Callable[[str], None] = print,
     ):
         self._arm, self._limits, self._joints = arm, limits, np.array(joints[:6], float)
-        self._speed, self._say = speed, say
+        self._speed, self._acceleration, self._say = speed, acceleration, say
 
     def joints(self) -> np.ndarray:
         """Return where it was told to go."""
@@ -26,9 +33,7 @@ class DryArm:
     def push(self, push: Push) -> None:
         """Say the command, after the checks that a real one passes."""
         start, end = push.poses[0], push.poses[-1]
-        refuse_motion(
-            start[:3], end[:3], speed=self._speed, acceleration=self._limits.acceleration_m_s2, limits=self._limits
-        )
+        refuse_motion(start[:3], end[:3], speed=self._speed, acceleration=self._acceleration, limits=self._limits)
         pose = refuse_pose(tcp_pose(self._arm, end))
         self._say(f"dry: moveL({np.round(pose, 4).tolist()}, speed {self._speed:g} m/s), {push.seconds:.2f} s")
         self._joints = np.array(push.joints[-1], float)

@@ -8,13 +8,19 @@ from collections.abc import Callable
 from typing import Any
 
 from pregrasp_jax.deploy.devices import DeviceError, refuse_missing
+from pregrasp_jax.messages import one_line
 
 MAX_FORCE_N = 40.0
 
-_TARGET, _FINGERTIP, _WIDTH, _STATUS = 0x0000, 0x0102, 0x010B, 0x010C
+_TARGET, _STATUS, _WIDTH = 0x0000, 0x010C, 0x0113
+"""The width is the one with fingertips, as it is commanded; 0x010B has it without."""
+
 _GRIP_WITH_OFFSET, _STOP = 16, 8
 _BUSY, _HELD, _SWITCHES, _SAFETY_ERROR = 1 << 0, 1 << 1, 0b111100, 1 << 6
 _PERIOD = 0.02
+_BEGINS = 0.3
+"""s within which the fingers begin to move, if they have to."""
+
 _TIMEOUT = 3.0
 """s for the fingers to arrive; the whole way takes under 1 s."""
 
@@ -88,7 +94,8 @@ class Rg2:
         words = [round(self._force * 10), round(width_m * 1e4), _GRIP_WITH_OFFSET]
         self._call(self._client.write_registers, _TARGET, words)
         begun = self._clock()
-        time.sleep(_PERIOD)
+        while not (status := self._status()) & _BUSY and self._clock() - begun < _BEGINS:
+            time.sleep(_PERIOD)
         while (status := self._status()) & _BUSY:
             if self._clock() - begun > _TIMEOUT:
                 self._call(self._client.write_registers, _TARGET, [words[0], words[1], _STOP])
@@ -112,7 +119,7 @@ class Rg2:
         try:
             answer = function(*args, device_id=self._unit, **options)
         except self._errors as error:
-            raise DeviceError(f"the gripper does not answer ({' '.join(str(error).split())})") from None
+            raise DeviceError(f"the gripper does not answer ({one_line(error)})") from None
         if answer.isError():
             raise DeviceError(f"the gripper refuses ({answer}); is its unit id {self._unit}?")
         return answer

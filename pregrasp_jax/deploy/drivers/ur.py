@@ -15,7 +15,9 @@ from pregrasp_jax.deploy.decision import Push
 from pregrasp_jax.deploy.devices import DeviceError, refuse_missing
 from pregrasp_jax.deploy.guard import START_ERROR, TCP_ERROR, ArmState, Limits, refuse_motion, refuse_pose, refuse_state
 from pregrasp_jax.deploy.poses import grasp_point, tcp_pose
+from pregrasp_jax.messages import one_line
 from pregrasp_jax.robot.kinematics import Arm
+from pregrasp_jax.spaces.motion import SETTLE_TIME
 
 _ARRIVED = 0.002
 """m from the end of a motion at which it is done."""
@@ -92,7 +94,7 @@ class UrArm:
         except DeviceError:
             raise
         except Exception as error:  # boost's and ur-rtde's own
-            raise DeviceError(f"no UR controller at {host} ({' '.join(str(error).split())})") from None
+            raise DeviceError(f"no UR controller at {host} ({one_line(error)})") from None
         offset = np.asarray(self._control.getTCPOffset(), float)
         wanted = np.concatenate([self._arm.flange_from_hand[:3, 3], np.zeros(3)])
         if offset.shape != (6,) or np.abs(offset - wanted).max() > TCP_ERROR:
@@ -137,6 +139,7 @@ class UrArm:
                 "Was it moved by hand? Bring it to the start pose"
             )
         self._move(push.poses[-1])
+        time.sleep(SETTLE_TIME)
 
     def lift(self, height_m: float) -> None:
         """Move straight up from where the tool is, turned as it is."""
@@ -145,7 +148,10 @@ class UrArm:
         self._move_tool(np.concatenate([pose[:3] + up, pose[3:]]))
 
     def stop(self) -> None:
-        """Stop where it is; a controller whose link is down has stopped by itself."""
+        """Stop where it is, if the controller still takes commands, whether it still tells or not.
+
+        Its own program ends when the link for commands is cut; until then a motion that is under way goes on.
+        """
         if self._control is not None and self._is_up():
             self._control.stopL(_STOP)
 
@@ -158,7 +164,7 @@ class UrArm:
         self._control = self._receive = None
 
     def _is_up(self) -> bool:
-        return bool(self._control and self._control.isConnected() and self._receive and self._receive.isConnected())
+        return bool(self._control and self._control.isConnected())
 
     @staticmethod
     def _quietly(call: Any) -> None:
