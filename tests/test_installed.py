@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-import tarfile
 import venv
 import zipfile
 from dataclasses import dataclass
@@ -52,8 +51,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
         checkout.mkdir(exist_ok=True)
         copy(ROOT / name, checkout / name)
     sdist = _build("sdist", checkout, folder)
-    with tarfile.open(sdist) as file:
-        file.extractall(folder / "unpacked", filter="data")
+    shutil.unpack_archive(sdist, folder / "unpacked")  # of tarfile, Python 3.11.0 to 3.11.3 know no filter
     (unpacked,) = (folder / "unpacked").iterdir()
     return Built(sdist, _build("wheel", unpacked, folder))
 
