@@ -18,8 +18,8 @@ from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.spaces.workspace import TABLE
 from pregrasp_jax.task import push_grasp, registry
 from pregrasp_jax.task.push_grasp import plan_stroke, stroke_actions
-from pregrasp_jax.task.stroke_rules import GraspOutcome, end_reason, stable
-from pregrasp_jax.types import MAX_OBJECTS, REASONS, SceneParams, Touch
+from pregrasp_jax.task.stroke_rules import stable
+from pregrasp_jax.types import MAX_OBJECTS, SceneParams
 
 KIND = registry.get_kind("push_grasp")
 
@@ -159,57 +159,6 @@ def test_an_index_is_a_cell_a_heading_and_the_middle_aperture(robot, bank):
     assert primitive.normal(stroke) is stroke
     mirrored = [primitive.choice(primitive.normal(actions.mirror(jnp.int32(k)))) for k in (0, 1, 4, 15)]
     assert mirrored == [0, 15, 12, 1]
-
-
-def touching(*pairs, links=13):
-    contacts = np.zeros((links, MAX_OBJECTS), bool)
-    for link, slot in pairs:
-        contacts[link, slot] = True
-    return Touch(*[jnp.zeros(())] * 3, jnp.asarray(contacts), jnp.zeros(MAX_OBJECTS, bool))  # pyright: ignore
-
-
-def test_a_grasp_is_stable_if_one_object_is_touched_not_by_tips_alone():
-    is_tip = np.arange(13) >= 10
-    assert stable(touching((4, 2), (11, 2)), is_tip).tolist() == [i == 2 for i in range(8)]
-    for unstable in (touching(), touching((10, 2), (11, 2)), touching((4, 2), (11, 3)), touching((10, 2), (4, 3))):
-        assert not stable(unstable, is_tip).any()
-
-
-def outcome(**changes):
-    none = jnp.zeros(MAX_OBJECTS, bool)
-    blank = GraspOutcome(
-        collided=jnp.bool_(False),
-        held=none,
-        stable=none,
-        toppled=none,
-        off_table=none,
-        final=jnp.bool_(False),
-        obstruction=jnp.int32(0),
-        diverged=jnp.bool_(False),
-    )
-    slots = {name: none.at[jnp.array(value)].set(True) for name, value in changes.items() if isinstance(value, list)}
-    return blank.replace(**{**changes, **slots})
-
-
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({}, "running"),
-        ({"held": [1], "stable": [1]}, "running"),  # an obstacle, by PPG's own choice
-        ({"held": [1], "stable": [1], "final": jnp.bool_(True)}, "obstacle_grasped"),
-        ({"held": [0], "stable": [0]}, "target_held"),
-        ({"held": [0], "stable": [0], "off_table": [3], "toppled": [2]}, "target_held"),
-        ({"held": [0]}, "target_not_alone"),
-        ({"held": [0, 1], "final": jnp.bool_(True)}, "target_not_alone"),
-        ({"off_table": [0]}, "off_table"),
-        ({"off_table": [1], "toppled": [2]}, "running"),
-        ({"toppled": [0]}, "target_toppled"),
-        ({"held": [0], "stable": [0], "diverged": jnp.bool_(True)}, "nan"),
-        ({"obstruction": jnp.int32(2)}, "unreachable"),
-    ],
-)
-def test_reasons(changes, reason):
-    assert REASONS[int(end_reason(outcome(**changes), jnp.int32(0)))] == reason
 
 
 def test_refusals(bank, robot):
