@@ -337,6 +337,17 @@ class TaskOverrides:
 
 
 @dataclass(frozen=True, kw_only=True)
+class StrokesOverrides:
+    """What an evaluation may change of how Target-PPG plays; null keeps what its policy was trained with."""
+
+    mask_radius: float | None = None
+    """m; only strokes that begin so near to the target; 0 considers all."""
+    free_space: FreeSpace | None = None
+    """When it reaches for the target: once a stroke can take it and nothing else, or (`cluster`) once nothing stands
+    within 10 mm of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class PlanningConfig:
     """A search in a scene that is rebuilt from the camera's pictures, see docs/planning.md."""
 
@@ -370,6 +381,7 @@ class EvaluationConfig:
     scene: SceneConfig = field(default_factory=SceneConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     task: TaskOverrides = field(default_factory=TaskOverrides)
+    strokes: StrokesOverrides = field(default_factory=StrokesOverrides)
     plan: bool = False
     """Let a trained policy search in a rebuilt scene before every push."""
     planning: PlanningConfig = field(default_factory=PlanningConfig)

@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from pregrasp_jax.policies import free_space
-from pregrasp_jax.policies.free_space import make_cluster, make_feasible
+from pregrasp_jax.policies.free_space import MAX_START, make_cluster, make_feasible
 from pregrasp_jax.policies.strokes import guided_stroke, outline, squared_distance
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.spaces import grid
@@ -101,6 +101,9 @@ def test_a_target_that_is_surrounded_is_not(feasible):
 def test_a_target_too_large_for_the_hand_is_tried_only_when_nothing_else_is_left(feasible):
     assert not feasible((0.0, 0.0, 0.12), (0.2, 0.2, 0.02))[1]
     assert feasible((0.0, 0.0, 0.12))[1]
+    for corner in ((-0.2, -0.2), (-0.2, 0.2), (0.2, -0.2), (0.2, 0.2)):
+        stroke, there_is = feasible((*corner, 0.12))
+        assert there_is and np.abs(stroke.start.xy).max() <= MAX_START, "from where the hand can get to"
 
 
 def test_without_a_target_in_sight_there_is_no_last_stroke(feasible):

@@ -126,5 +126,33 @@ def test_the_preset_collects_grasps_learns_from_them_and_is_evaluated(tmp_path, 
     assert main(["train", "ppg", "--run-dir", str(tmp_path / "run"), *options]) == 0
     assert "done: 4 stable grasps learnt from" in capfd.readouterr().out
     policy = f"target-ppg:{tmp_path / 'run'}"
-    assert main(["evaluate", "--policy", policy, "--episodes", "2", "--scene.test-scenes", "2"]) == 0
+    evaluate = ["evaluate", "--policy", policy, "--episodes", "2", "--scene.test-scenes", "2", "--json"]
+    assert main([*evaluate, str(tmp_path / "a.json")]) == 0
     assert "on 2 seen scenes" in capfd.readouterr().out
+    others = ["--strokes.free-space", "cluster", "--strokes.mask-radius", "0.1"]
+    assert main([*evaluate, str(tmp_path / "b.json"), *others]) == 0
+    assert main(["compare", str(tmp_path / "a.json"), str(tmp_path / "b.json")]) == 0
+    said = capfd.readouterr().out
+    assert "differs in strokes.free_space: feasible | cluster" in said
+    assert "differs in strokes.mask_radius: 0.0 | 0.1" in said
+
+
+@pytest.mark.parametrize(
+    ("policy", "settings", "message"),
+    [
+        (
+            "pretrained",
+            ["free-space", "cluster"],
+            "strokes.free_space is about Target-PPG, not about policy pretrained",
+        ),
+        ("ppg", ["mask-radius", "0.1"], "strokes.mask_radius is about Target-PPG, not about policy ppg"),
+        ("target-strokes", ["mask-radius", "0.1"], "policy target-strokes draws strokes everywhere"),
+        ("target-ppg", ["mask-radius", "-1"], "strokes.mask_radius = -1.0 is out of range"),
+        ("target-ppg", ["free-space", "wide"], "feasible"),
+    ],
+)
+def test_how_target_ppg_plays_is_refused_where_it_means_nothing(policy, settings, message, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(["evaluate", "--policy", policy, "--episodes", "1", f"--strokes.{settings[0]}", settings[1]])
+    error = capsys.readouterr().err
+    assert exit_.value.code == 2 and error.startswith("error: ") and error.count("\n") == 1 and message in error

@@ -18,6 +18,7 @@ from pregrasp_jax.config import (
     EvaluationConfig,
     PlaceConfig,
     PlanningConfig,
+    StrokesOverrides,
     TaskConfig,
     TaskOverrides,
     with_absolute_paths,
@@ -74,6 +75,7 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     prepare()
     trained = _load(request.policy)
     _check_planning(request, trained)
+    _check_strokes(request)
     config = _environment_config(request, Config() if trained is None else trained.config)
     if trained is not None:
         _refuse_other_hand(config, trained.config)
@@ -96,7 +98,7 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     if config.network.mirror and not env.symmetric:
         say(f"note: the policy averages mirror images, which are no scenes of workspace '{env.workspace.name}'")
     _, style = _named(request.policy)
-    played = learned.play(env, trained, style, request)
+    played = learned.play(env, config, trained, style, request)
     if not played.fits:
         raise ValueError(f"policy {trained.origin} does not fit its network in this version of the package")
     return Player(played.policy, functools.partial(jax.jit(played.q_values), trained.params), env, config)
@@ -156,6 +158,21 @@ def _check_planning(request: EvaluationConfig, trained: TrainedPolicy | None) ->
     request.planning.validate()
 
 
+def _check_strokes(request: EvaluationConfig) -> None:
+    """Refuse settings of Target-PPG for a policy that has no use for them."""
+    given, random = _given(request.strokes), request.policy in STROKE_SCRIPTS
+    if given and "target-" not in request.policy.partition(":")[0]:
+        raise ValueError(
+            f"strokes.{next(iter(given))} is about Target-PPG, not about policy {request.policy}; allowed with it: "
+            "target-ppg, target-ppg:FOLDER, target-strokes"
+        )
+    if random and request.strokes.mask_radius:
+        raise ValueError(
+            f"strokes.mask_radius = {request.strokes.mask_radius}: policy {request.policy} draws strokes everywhere; "
+            "allowed with it: target-ppg, target-ppg:FOLDER"
+        )
+
+
 def _load(spec: str) -> TrainedPolicy | None:
     """Return the trained policy that `spec` names, None for a script."""
     refuse_unknown_policy(spec, key="policy")
@@ -196,6 +213,7 @@ def _environment_config(request: EvaluationConfig, trained: Config) -> Config:
         scene=dataclasses.replace(request.scene, test_scenes=test_scenes),
         physics=request.physics,
         task=_task(trained.task, request.task),
+        strokes=dataclasses.replace(trained.strokes, **_given(request.strokes)),
     )
     return config.validate()
 
@@ -217,7 +235,7 @@ def _task(trained: TaskConfig, overrides: TaskOverrides) -> TaskConfig:
     return dataclasses.replace(trained, **_given(overrides) | {"place": place})
 
 
-def _given(overrides: TaskOverrides | PlaceConfig) -> dict[str, Any]:
+def _given(overrides: TaskOverrides | PlaceConfig | StrokesOverrides) -> dict[str, Any]:
     """Return what is to be changed."""
     return {key: value for key, value in vars(overrides).items() if value is not None}
 

@@ -19,6 +19,9 @@ _OUTCOMES = ("both", "only A", "only B", "neither")
 _SAME = ("object_set", "scene_bank_hash", "hull_bank_hash")
 """What two evaluations must share before their episodes can be paired."""
 
+_OF_TARGET_PPG = ("strokes.free_space", "strokes.mask_radius")
+"""What an evaluation may choose of strokes; everything else of them belongs to the training."""
+
 
 def policy_name(document: Mapping[str, Any]) -> str:
     """Return what decided in an evaluation: a policy, or a search that asks it."""
@@ -235,10 +238,10 @@ def _differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
     for key in sorted(set(searches[0]) | set(searches[1])):
         if searches[0].get(key) != searches[1].get(key):
             yield f"planning.{key}: {searches[0].get(key, 'off')} | {searches[1].get(key, 'off')}"
-    tasks = [flatten(document.get("config", {}).get("task", {})) for document in (a, b)]
-    for key in sorted(set(tasks[0]) & set(tasks[1]) - {"camera", "workspace"}):
-        if tasks[0][key] != tasks[1][key]:
-            yield f"task.{key}: {tasks[0][key]} | {tasks[1][key]}"
+    played = [flatten(document.get("config", {})) for document in (a, b)]
+    for key in sorted(set(played[0]) & set(played[1]) - {"task.camera", "task.workspace"}):
+        if (key.startswith("task.") or key in _OF_TARGET_PPG) and played[0][key] != played[1][key]:
+            yield f"{key}: {played[0][key]} | {played[1][key]}"
 
 
 def format_comparison(comparison: Comparison) -> str:

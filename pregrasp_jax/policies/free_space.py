@@ -99,7 +99,7 @@ def make_feasible(robot: Robot) -> FinalStroke:
     wide = _widened(fronts, round(MARGIN / _FINEST)) + MARGIN
 
     def try_heading(seen: Seen, yaw: jax.Array, lateral: jax.Array) -> tuple[PushGrasp, jax.Array, jax.Array]:
-        """Return strokes [A] of all apertures, their clearance [A] m, and which are feasible [A] bool."""
+        """Return strokes [A] of all apertures, their clearance [A] m (-inf out of reach), and which are feasible."""
         ahead, aside = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)]), jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)])
         offset = seen.points - seen.centroid[None]
         x, y = offset @ ahead, offset @ aside - lateral
@@ -128,11 +128,12 @@ def make_feasible(robot: Robot) -> FinalStroke:
         tables = (fronts, wide, stations, half_widths)
         clearance, fits = jax.vmap(try_aperture)(*(jnp.asarray(table, jnp.float32) for table in tables))
         start = end - DISTANCE * ahead
-        fits &= jnp.any(seen.target) & (jnp.max(jnp.abs(start)) <= MAX_START)
+        in_reach = jnp.max(jnp.abs(start)) <= MAX_START
+        fits &= jnp.any(seen.target) & in_reach
         strokes = jax.vmap(lambda aperture: push_grasp(start, yaw, aperture, final=True))(
             jnp.asarray(APERTURES, jnp.float32)
         )
-        return strokes, clearance, fits
+        return strokes, jnp.where(in_reach, clearance, -jnp.inf), fits
 
     def final_stroke(state: EnvState, key: jax.Array) -> tuple[PushGrasp, jax.Array]:
         del key
@@ -148,7 +149,7 @@ def make_feasible(robot: Robot) -> FinalStroke:
         score = jnp.where(fits, _CLEAR, 0.0) + clearance
         best = jnp.argmax(score.ravel())
         stroke = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:])[best], strokes)
-        return stroke, fits.ravel()[best] | alone
+        return stroke, fits.ravel()[best] | (alone & (score.ravel()[best] > -jnp.inf))
 
     return final_stroke
 
