@@ -4,7 +4,8 @@
 
 Every object of the set stands alone, `AHEAD` of where the hand comes down, turned at random, 20 mm to the left of the
 heading, on it, or 20 mm to the right. The hand pushes 0.15 m, closes, lifts 0.3 m and holds for a second. `--packed N`
-measures instead how many random strokes per second N packed scenes take side by side, and how they end.
+measures instead how many random strokes per second N packed scenes take side by side, and how they end, `--decide W`
+what a decision of untrained networks of width W takes.
 """
 
 import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
@@ -19,9 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax.assets.sets import builtin_bank
-from pregrasp_jax.config import Config, TaskConfig
+from pregrasp_jax.config import Config, StrokesConfig, TaskConfig
 from pregrasp_jax.evaluation.clearing import HOLD_TIME, own_protocol
+from pregrasp_jax.learning.imitation import StrokeFunction
 from pregrasp_jax.physics import make_engine
+from pregrasp_jax.policies.ppg import greedy
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.spaces.workspace import TABLE
@@ -69,6 +72,23 @@ def packed(num_scenes: int, threads: int, *, rounds: int = 4) -> dict[str, float
     return {"strokes": total, "strokes_per_second": total / wall, "strokes_per_cpu_second": total / cpu, **shares}
 
 
+def decide(width: float, *, rounds: int = 20) -> dict[str, float]:
+    """Return the median ms and processor ms of a decision: all 16 maps of one scene, and an aperture."""
+    config = Config(task=TaskConfig(robot="barrett", primitive="push_grasp"), strokes=StrokesConfig(width=width))
+    env = make_env(config, split="test", threads=1)
+    function = StrokeFunction(config.strokes, env.primitive.actions)
+    params, state = function.init(jax.random.key(0)), jax.jit(env.reset_to)(0)
+    choose = jax.jit(greedy(function))
+    jax.block_until_ready(choose(params, state, jax.random.key(0)))
+    times = np.zeros((rounds, 2))
+    for row in times:
+        row -= time.perf_counter(), time.process_time()
+        jax.block_until_ready(choose(params, state, jax.random.key(0)))
+        row += time.perf_counter(), time.process_time()
+    wall, cpu = 1000 * np.median(times, axis=0)
+    return {"width": width, "ms": float(wall), "cpu_ms": float(cpu)}
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -76,7 +96,11 @@ def main() -> None:
     parser.add_argument("--object-set", choices=["seen", "unseen"], default="seen", help="which objects")
     parser.add_argument("--threads", type=int, default=0, help="of physics; 0 takes every core")
     parser.add_argument("--packed", type=int, default=0, help="packed scenes side by side")
+    parser.add_argument("--decide", type=float, default=0.0, metavar="WIDTH", help="width of networks that decide")
     arguments = parser.parse_args()
+    if arguments.decide:
+        print(json.dumps(decide(arguments.decide)))
+        return
     if arguments.packed:
         print(json.dumps(packed(arguments.packed, arguments.threads)))
         return
