@@ -177,7 +177,7 @@ class LearnerConfig:
     siblings: bool = False
     """Learn from all pushes that were made from a state (`exploration.branches`) whenever one of them is sampled."""
     warmup: int = 500
-    """Env steps of pure exploration before the first update."""
+    """Env steps with `exploration.epsilon_start` before the first update."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -128,10 +128,10 @@ def test_linear_schedule(step, value):
         assert schedule.dtype == jnp.float32 and float(schedule) == pytest.approx(value)
 
 
-def test_the_warm_up_only_explores():
+def test_the_warm_up_explores_as_the_start_does():
     config = ExplorationConfig(epsilon_start=0.5, epsilon_end=0.1)
     values = [float(epsilon_at(step, config, warmup=50, decay=100)) for step in (0, 49, 50, 100)]
-    assert values == pytest.approx([1.0, 1.0, 0.3, 0.1])
+    assert values == pytest.approx([0.5, 0.5, 0.3, 0.1])
 
 
 def test_softmax_action_follows_its_distribution_inside_the_mask():

@@ -177,7 +177,7 @@ def make_collect(
         env: the scenes.
         q_function: values of pushes.
         config: exploration.
-        warmup: env steps of pure exploration.
+        warmup: env steps before the first update.
         vmap: maps pushes and resets over scenes.
     """
 
@@ -259,16 +259,16 @@ def _with_branches(states: EnvState, config: ExplorationConfig) -> EnvState:
 def epsilon_at(
     env_steps: jax.Array | int, config: ExplorationConfig, *, warmup: int, decay: jax.Array | np.floating | float
 ) -> jax.Array:
-    """Return the share of random actions () after `env_steps` pushes; 1 during the warm-up.
+    """Return the share of random actions () after `env_steps` pushes; during the warm-up that of the start.
 
     Args:
         env_steps: so far.
         config: where it begins and ends.
-        warmup: env steps of pure exploration.
+        warmup: env steps before the first update.
         decay: env steps after which it stays, see `schedules`.
     """
     decayed = exploration.linear_schedule(env_steps, start=config.epsilon_start, end=config.epsilon_end, steps=decay)
-    return jnp.where(env_steps < warmup, 1.0, decayed)
+    return jnp.where(env_steps < warmup, config.epsilon_start, decayed)
 
 
 def _steps(root: jax.Array, states: EnvState, actions: jax.Array, results: StepResult, next_states: EnvState) -> Steps:
