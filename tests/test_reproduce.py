@@ -18,6 +18,7 @@ from pregrasp_jax.sweep.driver import Driver
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.paper_page import write_paper_page
 from pregrasp_jax.sweep.spec import Spec, spec_from, to_plain
+from pregrasp_jax.sweep.trials import evaluation_files
 
 NAMES = ["confined", "figure4", "table1", "table2", "transfer"]
 
@@ -121,10 +122,12 @@ def test_the_same_command_goes_on_and_another_budget_is_refused(reproduced):
     again = _open(folder.path, spec)
     assert Driver(again, spec, Here(again, spec), say=lambda line: None).run() == 0
     assert sum(event["event"] == "started" for event in folder.events()) == 8
-    more = dataclasses.replace(spec, tests={**spec.tests, "mine": {"episodes": 30}})
-    again = _open(folder.path, more)
-    assert Driver(again, again.spec(), Here(again, again.spec()), say=lambda line: None).run() == 0
-    assert all((folder.run(known.trial) / "evaluations" / "mine.json").exists() for known in folder.states())
+    for episodes in (30, 40):  # other options under the same name are measured, too
+        more = dataclasses.replace(spec, tests={**spec.tests, "mine": {"episodes": episodes}})
+        again = _open(folder.path, more)
+        assert Driver(again, again.spec(), Here(again, again.spec()), say=lambda line: None).run() == 0
+        files = [evaluation_files(more, k.trial, folder.run(k.trial))["mine"] for k in folder.states()]
+        assert [json.loads(file.read_text())["episodes"] for file in files] == [episodes] * len(files)
     assert all(len((folder.run(k.trial) / "sessions").read_text().splitlines()) == 1 for k in folder.states())
     other = with_stub(experiments.make_spec(experiments.read_experiment("table2")), **{"train.env_steps": 400})
     with pytest.raises(ValueError, match=r"began with another set .*; allowed is the same, or another --dir"):

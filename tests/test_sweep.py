@@ -18,6 +18,7 @@ import pytest
 from PIL import Image
 
 from pregrasp_jax import yaml_file
+from pregrasp_jax.cli.main import main
 from pregrasp_jax.sweep import driver, state
 from pregrasp_jax.sweep.driver import Driver
 from pregrasp_jax.sweep.folder import SweepFolder
@@ -27,6 +28,7 @@ from pregrasp_jax.sweep.spec import Spec, spec_from
 from pregrasp_jax.sweep.state import Job, TrialState
 from pregrasp_jax.sweep.table import make_table
 from pregrasp_jax.sweep.table_files import format_table
+from pregrasp_jax.sweep.trials import evaluation_files
 from pregrasp_jax.sweep.worker import BUSY, UNWRITTEN, Worker, environment, measured
 
 STUB = Path(__file__).parent / "stub_trainer.py"
@@ -128,12 +130,13 @@ def test_halving_stops_by_signal_and_goes_on_by_resume(halved):
 
 
 def test_the_winner_is_trained_again_with_fresh_seeds_and_tested(halved):
-    folder, _, _ = halved
+    folder, spec, _ = halved
     finals = [known for known in folder.states() if known.trial.final]
     assert [known.trial.seed for known in finals] == [10, 11]
     for known in finals:
         assert known.trial.settings["task.r_out"] == 0.15 and known.outcome == "done"
-        document = json.loads((folder.run(known.trial) / "evaluations" / "test.json").read_text())
+        file = evaluation_files(spec, known.trial, folder.run(known.trial))["test"]
+        document = json.loads(file.read_text())
         assert document["episodes"] == 20
 
 
@@ -150,6 +153,8 @@ def test_the_table_ranks_and_says_what_is_noise(halved):
     best, *others = [row for row in table.rows if not row.final]
     assert best.varied == {"task.r_out": 0.15, "learner.learning_rate": 1e-3} and best.word == "done"
     assert [row.word for row in others] == ["dropped"] * 3
+    with pytest.raises(ValueError, match=r"reference 'first' is no setting; allowed: 'task\.r_out=0\.15, learner"):
+        make_table(folder, spec, reference="first")
     text = format_table(table)
     assert "Differences within" in text and text.splitlines()[0].split()[:2] == ["rank", "setting"]
     assert "final" in text and "test: test" in text
@@ -263,6 +268,9 @@ def test_a_sweep_that_is_asked_to_stop_goes_on_where_it_was(tmp_path):
     assert drive(folder, spec, launcher) == 143
     (known,) = folder.states()
     assert known.outcome == "stopped" and known.failures == 0 and 0 < known.env_steps < LENGTH
+    with folder.drive(), pytest.raises(SystemExit):
+        main(["sweep", "resume", str(folder.path)])
+    assert folder.stopping, "what another driver was asked to do is not taken back"
     folder.ask_to_stop(False)
     assert drive(folder, spec, Here(folder, spec)) == 0
     (known,) = assert_whole(folder)
@@ -314,6 +322,19 @@ def test_tpe_asks_for_what_looks_good_and_forgets_nothing_when_it_goes_on(tmp_pa
     told = {t.number: t.value for t in study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))}
     assert {known.trial.proposal: known.score for known in states}.items() >= told.items() and len(told) >= 6
     assert not [known for known in states if not 3 <= known.trial.settings["task.max_pushes"] <= 9]
+
+
+def test_tpe_ends_when_it_has_proposed_every_setting_there_is(tmp_path):
+    pytest.importorskip("optuna")
+    search, small = {"method": "tpe", "trials": 7}, {"train.env_steps": 100, "train.minutes": 0}
+    spec = make_spec(search=search, parameters={"task.max_pushes": {"int": [3, 4]}}, set=small)
+    folder = SweepFolder.create(tmp_path / "sweep", spec)
+    assert drive(folder, spec, Here(folder, spec)) == 0
+    assert len(folder.states()) == 2
+    study = driver.Study(folder.path, spec)
+    assert study.propose(folder.states()) == (None, -1)
+    asked = len(study._study.trials)
+    assert study.propose(folder.states()) == (None, -1) and len(study._study.trials) == asked, "it is not asked again"
 
 
 def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):

@@ -13,6 +13,8 @@ from pregrasp_jax.cli.sweep import drive
 from pregrasp_jax.sweep import driver, slurm
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.spec import Spec
+from pregrasp_jax.sweep.trials import evaluation_files
+from pregrasp_jax.sweep.worker import BUSY, UNWRITTEN
 
 FAKE = Path(__file__).parent / "fake_sbatch.py"
 
@@ -34,6 +36,31 @@ def test_the_script_says_what_a_task_needs_and_is_replaced_by_the_worker(tmp_pat
     assert {f"#SBATCH --{option}" for option in [*wanted, "partition=gpu", "time=4:00:00"]} < options
     assert lines[0] == "#!/bin/bash" and "#SBATCH --requeue" in options
     assert re.fullmatch(last, lines[-1])
+
+
+@pytest.mark.parametrize(
+    ("code", "failures", "again"),
+    [(0, 0, False), (143, 0, True), (BUSY, 0, True), (UNWRITTEN, 0, True), (1, 2, True), (1, 3, False), (2, 0, False)],
+)
+def test_a_task_goes_back_into_the_queue_unless_there_is_nothing_left_to_do(
+    code, failures, again, tmp_path, monkeypatch
+):
+    spec = make_spec()
+    folder = SweepFolder.create(tmp_path / "sweep", spec)
+    driver.plan(folder, spec)
+    trial = folder.states()[0].trial
+    ended = {"event": "ended", "id": trial.id, "rung": None, "outcome": "failed", "exit_code": 1, "seconds": 1.0}
+    for _ in range(failures):
+        folder.append(ended)
+    calls = []
+    monkeypatch.setattr(slurm.subprocess, "run", lambda command, **_: calls.append(command))
+    monkeypatch.setenv("SLURM_ARRAY_JOB_ID", "7")
+    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "3")
+    slurm.requeue(folder, trial, code)
+    assert calls == ([["scontrol", "requeue", "7_3"]] if again else [])
+    folder.ask_to_stop(True)
+    slurm.requeue(folder, trial, code)
+    assert len(calls) == again, "not while the sweep is asked to stop"
 
 
 def test_what_slurm_cannot_do_is_refused(tmp_path, monkeypatch):
@@ -81,7 +108,7 @@ def test_an_array_for_every_rung_with_requeue_and_the_winner_again(tmp_path, mon
     assert Counter(words.values()) == {"done": 2, "dropped": 1}
     done = [known for known in states if words[known.trial.id] == "done"]
     assert [known.trial.final for known in done] == [False, True]
-    assert (folder.run(done[1].trial) / "evaluations" / "test.json").exists()
+    assert evaluation_files(spec, done[1].trial, folder.run(done[1].trial))["test"].exists()
     for known in done:
         assert known.env_steps == 1200 and not (folder.run(known.trial) / "TWICE").exists()
     requeued = list(state.glob("requeued-*"))

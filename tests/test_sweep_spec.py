@@ -1,5 +1,6 @@
 """What is refused before a sweep starts, in one line; which settings there are; what becomes of them, as a function."""
 
+import dataclasses
 import random
 import re
 import sys
@@ -11,7 +12,7 @@ import pytest
 from pregrasp_jax import yaml_file
 from pregrasp_jax.cli.main import main
 from pregrasp_jax.sweep import checks, launchers, parameters, state
-from pregrasp_jax.sweep.spec import PROGRAM, Spec, read_spec, spec_from, to_plain
+from pregrasp_jax.sweep.spec import PROGRAM, Resources, Spec, read_spec, spec_from, to_plain
 from pregrasp_jax.sweep.state import TRIES, TrialState, next_jobs, read_states
 from pregrasp_jax.sweep.trials import flags, make_trial, setting_trials, train_command, trial_config
 
@@ -96,6 +97,9 @@ VARIANTS = {"parameters": None, "search": None, "stop": None, "final": None}
         ({**VARIANTS, "variants": {"a": {"policy": "clear", "task.r_out": 1}}}, "variants.a names a policy"),
         ({**VARIANTS, "variants": {"a": {"init_from": "nowhere"}}}, "variants.a.init_from = 'nowhere' does not exist"),
         ({**VARIANTS, "variants": {"a": {"init_from": 3}}}, "variants.a.init_from = 3 has the wrong type"),
+        ({**VARIANTS, "variants": {"a": {"task.r_out": 0.1}, "b": {"task.r_out": 0.1}}}, "variants.b is the same as "),
+        ({**VARIANTS, "variants": {"a": {"policy": "clear"}, "b": {"policy": "straight"}},
+          "stop": {"method": "halving", "rungs": [2000]}}, "halving needs two settings that are trained"),
         ({"variants": {"a": {}}}, "variants are not searched"),
     ],
 )  # fmt: skip
@@ -150,6 +154,11 @@ def test_command_lines_are_what_a_person_would_type(tmp_path):
         f"train cpu --run-dir {tmp_path}/run --films False --init-from pretrained --seed 3 --physics.threads 1 "
         "--replay.hindsight False --physics.engine native --train.fused-iterations None --learner.learning-rate 0.00025"
     )
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.yaml").touch()
+    wider = dataclasses.replace(spec, resources=Resources(cores=2))
+    words = " ".join(train_command(wider, trial, tmp_path / "run")[3:])
+    assert words == f"train resume {tmp_path}/run --films False --physics.threads 2"
     assert flags({"a.b_c": 1.5}) == ["--a.b-c", "1.5"]
     config = trial_config(spec, trial.settings)
     assert not config.replay.hindsight and config.learner.learning_rate == 0.00025 and config.network.width == 0.25

@@ -12,9 +12,16 @@ from pregrasp_jax import io, yaml_file
 from pregrasp_jax.config import Config
 from pregrasp_jax.settings import difference, to_dict
 
-CHANGEABLE = ("train.minutes", "train.episodes", "train.env_steps", "train.tensorboard", "assets.object_dir")
-"""Settings that may change when a run is resumed: when it stops, what it tells, and where its meshes lie, which must
-be the same ones."""
+CHANGEABLE = (
+    "train.minutes",
+    "train.episodes",
+    "train.env_steps",
+    "train.tensorboard",
+    "assets.object_dir",
+    "physics.threads",
+)
+"""Settings that may change when a run is resumed: when it stops, what it tells, where its meshes lie, which must be the
+same ones, and how many cores its physics takes, on which no result depends."""
 
 WHAT_MAY_CHANGE = f"allowed to change: {', '.join(CHANGEABLE)}; --init-from starts a new run from its parameters"
 """What a refusal says at its end."""

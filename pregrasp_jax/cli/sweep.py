@@ -71,9 +71,10 @@ def resume(
     opened = SweepFolder.open(folder)
     spec = opened.spec()
     check(spec, launcher=launcher)
-    opened.ask_to_stop(False)
-    for failed in [s for s in opened.states() if retry and s.failed]:
-        opened.append({"event": "retry", "id": failed.trial.id})
+    with opened.drive():  # what another driver was asked to do is not taken back
+        opened.ask_to_stop(False)
+        for failed in [s for s in opened.states() if retry and s.failed]:
+            opened.append({"event": "retry", "id": failed.trial.id})
     return drive(opened, spec, launcher=launcher, parallel=parallel)
 
 
@@ -162,7 +163,7 @@ def worker(
     if trial is None:
         return 0
     code = Worker(opened, spec, trial, rung=rung, cores=cores).run()
-    slurm.requeue(opened, code)
+    slurm.requeue(opened, trial, code)
     return code
 
 

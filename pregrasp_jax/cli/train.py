@@ -61,8 +61,8 @@ def _resume(stored: Config) -> Callable[..., Session]:
     ) -> Session:
         """Continue a run from its newest intact checkpoint; its report is written as after the first session.
 
-        Only train.minutes, train.episodes, train.env_steps, train.tensorboard and assets.object_dir may change, here or
-        in config.yaml. Schedules stay those of the length that the run had at first.
+        Only train.minutes, train.episodes, train.env_steps, train.tensorboard, assets.object_dir and physics.threads
+        may change, here or in config.yaml. Schedules stay those of the length that the run had at first.
 
         Args:
             run_dir: Folder of the run.

@@ -10,7 +10,7 @@ from pregrasp_jax.config import EvaluationConfig
 from pregrasp_jax.settings import from_dict, to_dict
 from pregrasp_jax.spaces.workspace import WORKSPACES, get_workspace
 from pregrasp_jax.sweep import parameters
-from pregrasp_jax.sweep.spec import PROGRAM, Spec
+from pregrasp_jax.sweep.spec import PROGRAM, Spec, Variant
 from pregrasp_jax.sweep.trials import trial_config
 
 GIVEN = {"seed": "seeds", "physics.threads": "resources.cores"}
@@ -91,7 +91,12 @@ def _names(spec: Spec) -> Iterator[str]:
     for name in itertools.chain(spec.set, spec.parameters, *varied):
         if name in GIVEN:
             yield f"{name} is decided by {GIVEN[name]}; allowed is that"
+    seen: list[Variant] = []
     for name, variant in spec.variants.items():
+        if variant in seen:
+            twin = list(spec.variants)[seen.index(variant)]
+            yield f"variants.{name} is the same as variants.{twin}; allowed is each setting once"
+        seen.append(variant)
         if variant.policy is not None and (variant.settings or variant.init_from):
             yield f"variants.{name} names a policy, which is not trained; allowed beside it is nothing"
         start = variant.init_from
@@ -113,8 +118,8 @@ def _stop(spec: Spec) -> Iterator[str]:
         yield f"stop.keep = {stop.keep} is out of range; allowed is between 0 and 1"
     if spec.search.method == "tpe":
         yield "stop.method halving compares settings that are known at the start; allowed with search.method tpe: none"
-    if num_settings(spec) < 2:
-        yield "stop.method halving needs two settings and more"
+    if num_settings(spec) - sum(variant.policy is not None for variant in spec.variants.values()) < 2:
+        yield "stop.method halving needs two settings that are trained, and more"
     varied = {
         name for settings in [spec.parameters, *(v.settings for v in spec.variants.values())] for name in settings
     }

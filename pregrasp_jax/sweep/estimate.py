@@ -71,7 +71,7 @@ def seconds_of(spec: Spec, settings: Mapping[str, Any]) -> float:
 def _share_trained(spec: Spec, trained: Sequence[Setting]) -> float:
     """Return how much of all trainings is done, at most 1, if halving gives some up."""
     steps = state.rungs(spec)
-    if not steps:
+    if not steps or not trained:
         return 1.0
     length = trial_config(spec, {**spec.set, **trained[0][0]}).train.env_steps
     ends = [*steps, length]

@@ -21,7 +21,7 @@ from typing import Any, TextIO
 from pregrasp_jax import io, yaml_file
 from pregrasp_jax.sweep.spec import Spec, read_spec, spec_from, to_plain
 from pregrasp_jax.sweep.state import Record, TrialState, read_states
-from pregrasp_jax.sweep.trials import Trial, evaluation_file, evaluations_of
+from pregrasp_jax.sweep.trials import Trial, evaluation_files
 
 SPEC, TRIALS, STOP = "spec.yaml", "trials.jsonl", "stop"
 
@@ -104,7 +104,7 @@ class SweepFolder:
 
     def lacks_tests(self, spec: Spec, trial: Trial) -> bool:
         """Return whether a trial that is done has tests to go through: of a spec that was edited since."""
-        return any(not evaluation_file(self.run(trial), name).exists() for name in evaluations_of(spec, trial))
+        return any(not file.exists() for file in evaluation_files(spec, trial, self.run(trial)).values())
 
     def append(self, event: Mapping[str, Any]) -> None:
         """Add an event, whole or not at all; a last line that a crash has cut is removed first.

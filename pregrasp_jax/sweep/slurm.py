@@ -17,6 +17,7 @@ from pregrasp_jax.sweep.estimate import memory_of
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.spec import Spec
 from pregrasp_jax.sweep.trials import Trial
+from pregrasp_jax.sweep.worker import BUSY, UNWRITTEN
 
 NOTICE = 180
 """s before the end of its time at which a task is asked to stop."""
@@ -24,7 +25,7 @@ NOTICE = 180
 MOST_REQUEUES = 50
 """Times that a task may put itself back into the queue."""
 
-_STOPPED = 143
+_STOPPED, _FAILED = 143, 1
 
 
 def check(spec: Spec) -> None:
@@ -124,10 +125,18 @@ def trial_of(folder: SweepFolder, spec: Spec, task: int, *, rung: int | None, fi
     return found if found.final or any(s.trial.id == found.id for s in alive) else None
 
 
-def requeue(folder: SweepFolder, code: int) -> None:
-    """Put this task back into the queue if it was stopped because its time was up, or it was in somebody's way."""
+def requeue(folder: SweepFolder, trial: Trial, code: int) -> None:
+    """Put this task back into the queue if its time was up, its trial is worked on elsewhere, or failed for now.
+
+    Args:
+        folder: of the sweep.
+        trial: that of the task.
+        code: of its worker.
+    """
     job, task = os.environ.get("SLURM_ARRAY_JOB_ID"), os.environ.get("SLURM_ARRAY_TASK_ID")
-    if code != _STOPPED or not job or folder.stopping:
+    again = (_STOPPED, _FAILED, BUSY, UNWRITTEN)
+    over = next(s.over for s in folder.states() if s.trial.id == trial.id)
+    if code not in again or (over and code == _FAILED) or not job or folder.stopping:
         return
     if int(os.environ.get("SLURM_RESTART_COUNT") or 0) < MOST_REQUEUES:
         # Where SLURM itself puts it back, after a preemption, this one is refused, which does no harm.

@@ -33,7 +33,7 @@ class Study:
         """Open or begin the study; `folder` is that of the sweep."""
         optuna = self._optuna = require_optuna()
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        self._spec = spec
+        self._spec, self._exhausted = spec, False
         backend = optuna.storages.journal.JournalFileBackend(str(folder / "optuna.log"))
         storage = optuna.storages.JournalStorage(backend)
         self._study = optuna.create_study(
@@ -61,7 +61,7 @@ class Study:
     def propose(self, states: Sequence[TrialState]) -> tuple[dict[str, Any] | None, int]:
         """Return a setting that was not tried yet and its number here; None when there were enough, or all."""
         groups = state.by_setting([s for s in states if not s.trial.final])
-        if len(groups) >= (self._spec.search.trials or 0):
+        if self._exhausted or len(groups) >= (self._spec.search.trials or 0):
             return None, -1
         for _ in range(100):
             asked = self._study.ask()
@@ -69,6 +69,7 @@ class Study:
             if make_trial(self._spec, setting, 0, number=0).group not in groups:
                 return setting, asked.number
             self._study.tell(asked.number, state=self._optuna.trial.TrialState.FAIL)
+        self._exhausted = True
         return None, -1
 
 

@@ -18,7 +18,7 @@ from pregrasp_jax.sweep import driver, state
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.spec import Spec
 from pregrasp_jax.sweep.state import TrialState
-from pregrasp_jax.sweep.trials import evaluation_file, evaluations_of, trial_config
+from pregrasp_jax.sweep.trials import evaluation_files, trial_config
 
 Interval = tuple[float, float]
 
@@ -118,7 +118,11 @@ def make_table(folder: SweepFolder, spec: Spec, *, reference: str | None = None)
     Args:
         folder: of the sweep.
         spec: of the sweep.
-        reference: label of the setting that others are compared with on test scenes; the best if None.
+        reference: label of the setting that others are compared with on test scenes; the best if None, or if that one
+            has not been tested yet.
+
+    Raises:
+        ValueError: there is no such setting.
     """
     states = folder.states()
     running = [s.trial.id for s in states if not s.over and folder.is_running(s.trial)]
@@ -127,6 +131,8 @@ def make_table(folder: SweepFolder, spec: Spec, *, reference: str | None = None)
     groups = [*state.ranking(spec, states), *finals]
     rows = [_row(folder, spec, rank, members, words) for rank, members in enumerate(groups, start=1)]
     tested = [row for row in rows if row.tests and (row.final or not finals)]
+    if reference and reference not in [row.label for row in rows]:
+        raise ValueError(f"reference {reference!r} is no setting; allowed: {', '.join(repr(r.label) for r in rows)}")
     chosen = next((row for row in tested if row.label == reference), tested[0] if tested else None)
     differences = _differences(chosen, tested) if chosen else {}
     least, what = _noise(spec, rows, differences)
@@ -165,8 +171,9 @@ def _validation_scenes(spec: Spec, members: Sequence[TrialState]) -> int:
 def _tests(folder: SweepFolder, spec: Spec, members: Sequence[TrialState]) -> dict[str, Tested]:
     """Return the tests of a setting that all its seeds have gone through."""
     found = {}
-    for name in evaluations_of(spec, members[0].trial):
-        files = [evaluation_file(folder.run(member.trial), name) for member in members]
+    written = [evaluation_files(spec, member.trial, folder.run(member.trial)) for member in members]
+    for name in written[0]:
+        files = [of_member[name] for of_member in written]
         if all(file.exists() for file in files):
             found[name] = tested([load_evaluation(file) for file in files])
     return found

@@ -110,18 +110,18 @@ def trial_config(spec: Spec, settings: Mapping[str, Any]) -> Config:
 def train_command(spec: Spec, trial: Trial, run: Path) -> list[str]:
     """Return the command line that starts a trial, or goes on with it."""
     if (run / "config.yaml").is_file():
-        return [*spec.program, "train", "resume", str(run), "--films", "False"]
-    options = {"seed": trial.seed, "physics.threads": spec.resources.cores, **trial.settings}
+        return [*spec.program, "train", "resume", str(run), "--films", "False", *flags(_cores(spec))]
+    options = {"seed": trial.seed, **_cores(spec), **trial.settings}
     start = ["--init-from", trial.init_from] if trial.init_from else []
     return [*spec.program, "train", spec.preset, "--run-dir", str(run), "--films", "False", *start, *flags(options)]
 
 
 def evaluate_command(spec: Spec, trial: Trial, name: str, run: Path) -> list[str]:
     """Return the command line of one of the evaluations of a trial."""
-    options = {"physics.threads": spec.resources.cores, **evaluations_of(spec, trial)[name]}
+    options = {**_cores(spec), **evaluations_of(spec, trial)[name]}
     if trial.policy is not None:
         options = {"seed": trial.seed, **options}
-    who = ["--policy", trial.policy or str(run), "--json", str(evaluation_file(run, name))]
+    who = ["--policy", trial.policy or str(run), "--json", str(evaluation_files(spec, trial, run)[name])]
     return [*spec.program, "evaluate", *who, *flags(options)]
 
 
@@ -133,14 +133,21 @@ def evaluations_of(spec: Spec, trial: Trial) -> Mapping[str, Mapping[str, Any]]:
     return {"test": {"episodes": spec.final.episodes, **given}}
 
 
-def evaluation_file(run: Path, name: str) -> Path:
-    """Return where an evaluation of a run is written."""
-    return run / EVALUATIONS / f"{name}.json"
+def evaluation_files(spec: Spec, trial: Trial, run: Path) -> dict[str, Path]:
+    """Return where the evaluations of a trial are written, by name; other options are another file."""
+    return {
+        name: run / EVALUATIONS / f"{name}-{io.content_hash(dict(options))[:8]}.json"
+        for name, options in evaluations_of(spec, trial).items()
+    }
 
 
 def flags(options: Mapping[str, Any]) -> list[str]:
     """Return options as a command line has them."""
     return [word for key, value in options.items() for word in (f"--{key.replace('_', '-')}", str(value))]
+
+
+def _cores(spec: Spec) -> dict[str, int]:
+    return {"physics.threads": spec.resources.cores}
 
 
 def _short(value: Any) -> str:

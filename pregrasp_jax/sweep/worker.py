@@ -20,7 +20,7 @@ from typing import Any
 from pregrasp_jax.sweep import state
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.spec import Spec
-from pregrasp_jax.sweep.trials import Trial, evaluate_command, evaluation_file, evaluations_of, train_command
+from pregrasp_jax.sweep.trials import Trial, evaluate_command, evaluation_files, train_command
 
 BUSY = 75
 """Exit code of a worker whose trial another one works on."""
@@ -107,8 +107,8 @@ class Worker:
             ending = self._train()
             if ending.outcome != state.DONE:
                 return ending
-        for name in evaluations_of(self.spec, self.trial):
-            if not evaluation_file(self.run_dir, name).exists():
+        for name, file in evaluation_files(self.spec, self.trial, self.run_dir).items():
+            if not file.exists():
                 ending = self._ended(self._call(evaluate_command(self.spec, self.trial, name, self.run_dir)))
                 if ending.outcome != state.DONE:
                     return ending
