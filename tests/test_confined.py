@@ -75,7 +75,7 @@ def test_every_dimension_of_every_place_is_a_setting():
     assert dimensions == {field.name for field in dataclasses.fields(PlaceConfig)}
     with pytest.raises(ValueError, match=r"task\.place\.half_width = 3\.0 is out of range"):
         Config(task=TaskConfig(place=PlaceConfig(half_width=3.0))).validate()
-    with pytest.raises(ValueError, match=r"workspace 'shelf': front = 0\.4 must be below back = 0\.3"):
+    with pytest.raises(ValueError, match=r"workspace 'shelf': front = 0\.4 must be below back = 0\.25"):
         get_workspace("shelf", {"front": 0.4})
 
 
@@ -92,7 +92,7 @@ def test_a_place_is_told_by_all_that_makes_it():
     wall = Box(center=(0.0, 0.4, 0.1), half_size=(0.2, 0.01, 0.1))
     places = [TABLE, SHELF, get_workspace("shelf"), Workspace(name="table", walls=(wall,))]
     assert len({place.content_hash for place in places}) == len(places)
-    assert get_workspace("shelf").content_hash == get_workspace("shelf", {"half_width": 0.3}).content_hash
+    assert get_workspace("shelf").content_hash == get_workspace("shelf", {"half_width": 0.25}).content_hash
 
 
 @pytest.mark.parametrize(

@@ -99,8 +99,8 @@ TABLE = Workspace(name="table")
 
 def make_shelf(
     *,
-    half_width: float = 0.30,
-    back: float = 0.30,
+    half_width: float = 0.25,
+    back: float = 0.25,
     front: float = -0.25,
     wall_height: float = 0.30,
     wall_thickness: float = 0.02,
