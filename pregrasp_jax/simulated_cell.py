@@ -170,7 +170,7 @@ def make_simulated_station(
     view = make_view(dataclasses.replace(cell, camera=CameraSettings()), decider, Path(), nominal=True)
     return Station(
         decider=decider,
-        cell=cell.runtime.cell,
+        cell=cell.runtime.cell or bundle.contract.camera.cell,
         log=DecisionLog(log, bundle.contract) if log else None,
         say=say,
         camera=view.camera,

@@ -2,7 +2,8 @@
 
 A process of its own (`python fake_ur.py MODE`), because the client's constructors hold the interpreter's lock. It
 integrates straight motions of the tool, and its mode says what goes wrong during the first one: nothing, `protective`
-stop, `stall`, `drop` of the link, `push` back with a force, or from the start `local` control, a wrong `tcp`.
+stop, `stall`, `drop` of the link, `push` back with a force, or from the start `local` control, a wrong `tcp`, a hand
+that is `turned`.
 """
 
 import math
@@ -14,7 +15,7 @@ import threading
 import time
 
 HOST, RATE = "127.0.0.1", 125.0
-START = [-0.45, 0.0, 0.1, 0.0, 0.0, 0.0]
+START = [-0.45, 0.0, 0.1, 1.2092, -1.2092, -1.2092]
 TCP = [0.0, 0.0, 0.172, 0.0, 0.0, 0.0]
 MOVE_L, MOVE_L_PATH = 3, 47
 
@@ -59,6 +60,8 @@ class Controller:
     def __init__(self, mode: str):
         self.mode, self.lock = mode, threading.Lock()
         self.pose, self.velocity, self.goal = list(START), [0.0] * 6, None
+        if mode == "turned":
+            self.pose[3:] = [1.0, -1.2092, -1.2092]
         self.speed, self.force = 0.1, [0.0] * 6
         self.runtime, self.status, self.ready, self.safety = 1, 1, 0, 1
         self.moved, self.frozen, self.dropped, self.stopping, self.answered = 0.0, False, False, False, True

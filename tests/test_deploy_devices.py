@@ -25,7 +25,15 @@ from pregrasp_jax.deploy.devices import DeviceError
 from pregrasp_jax.deploy.drivers.dry import DryArm, DryGripper
 from pregrasp_jax.deploy.files import FileSegmenter, FileSource
 from pregrasp_jax.deploy.guard import ArmState, Limits, refuse_motion, refuse_pose, refuse_state
-from pregrasp_jax.deploy.poses import grasp_point, matrix_of_vector, on_table, read_pose, rotation_vector, tcp_pose
+from pregrasp_jax.deploy.poses import (
+    angle_between,
+    grasp_point,
+    matrix_of_vector,
+    on_table,
+    read_pose,
+    rotation_vector,
+    tcp_pose,
+)
 from pregrasp_jax.robot import kinematics
 
 FAKE = Path(__file__).parent / "fake_ur.py"
@@ -50,6 +58,8 @@ def test_rotation_vectors_are_those_of_scipy():
         vector = rotation_vector(turn)
         np.testing.assert_allclose(Rotation.from_rotvec(vector).as_matrix(), turn, atol=1e-6)
         np.testing.assert_allclose(matrix_of_vector(vector), turn, atol=1e-6)
+        expected = Rotation.from_matrix(turn.T @ turns[0]).magnitude()
+        assert angle_between(vector, rotation_vector(turns[0])) == pytest.approx(expected, abs=1e-5)
 
 
 def test_the_tool_pose_brings_the_grasp_point_where_it_was_sent(decider: Decider):
@@ -285,7 +295,13 @@ def test_a_ur_arm_makes_a_push(decider: Decider, controller: Controller):
 @GROUP
 @pytest.mark.parametrize(
     ("controller", "said"),
-    [("protective", "protective stop"), ("stall", "stalled"), ("push", "pushed with 80 N"), ("drop", "link|s old")],
+    [
+        ("turned", "turned by 1. degrees"),
+        ("protective", "protective stop"),
+        ("stall", "stalled"),
+        ("push", "pushed with 80 N"),
+        ("drop", "link|s old"),
+    ],
     indirect=["controller"],
 )
 def test_a_push_that_goes_wrong_ends_in_one_line(decider: Decider, controller: Controller, said: str):
@@ -377,6 +393,9 @@ def test_a_gripper_opens_closes_and_holds():
     gripper.move(0.8)
     assert gripper.opening() == pytest.approx(0.8)
     assert gripper.grasp() and gripper.opening() == pytest.approx(60 / 110)
+    gripper.move(0.52)  # 57 mm: near enough to 60
+    with pytest.raises(DeviceError, match="stands 60 mm open instead of 55"):
+        gripper.move(0.5)
     with pytest.raises(DeviceError, match="allowed is 0 to 1"):
         gripper.move(float("nan"))
     gripper.close()

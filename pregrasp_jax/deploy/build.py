@@ -107,7 +107,7 @@ def make_station(
     try:
         return Station(
             decider=decider,
-            cell=cell.runtime.cell,
+            cell=cell.runtime.cell or bundle.contract.camera.cell,
             log=DecisionLog(log, bundle.contract) if log else None,
             say=say,
             camera=view.camera,

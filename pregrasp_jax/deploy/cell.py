@@ -109,8 +109,8 @@ class SimSettings:
 class RuntimeSettings:
     """How maps are made."""
 
-    cell: Literal["max", "second", "median"] = "max"
-    """Which of the points above a cell is its height."""
+    cell: Literal["max", "second", "median"] | None = None
+    """Which of the points above a cell is its height; null is the one that the policy was trained with."""
     threads: int = 1
 
 

@@ -125,6 +125,8 @@ class CameraEntry:
     looking: str
     depth: str
     intrinsics: str
+    cell: str
+    """Which of the points above a cell was its height in training: `max`, `second` or `median`."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,9 @@ REDUCED = 2
 START_ERROR = 0.02
 """m; a push starts where the last one was commanded to end, within this."""
 
+START_TURN = 0.05
+"""rad; and the hand is turned then as a push holds it, within this."""
+
 TCP_ERROR = 0.002
 """m; how far the controller's tool centre point may be from the contract's."""
 

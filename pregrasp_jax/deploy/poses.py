@@ -41,6 +41,11 @@ def matrix_of_vector(vector: np.ndarray) -> np.ndarray:
     return quat_to_matrix(np.array([np.cos(angle / 2), *np.sin(angle / 2) * axis]))
 
 
+def angle_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the angle, rad, by which two rotation vectors [3] differ."""
+    return float(np.linalg.norm(rotation_vector(matrix_of_vector(a).T @ matrix_of_vector(b))))
+
+
 def tcp_pose(arm: Arm, hand_pose: np.ndarray) -> np.ndarray:
     """Return the tool pose [6] (m, rotation vector) in the base frame that puts the grasp point at a pose [7].
 

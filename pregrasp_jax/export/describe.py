@@ -27,6 +27,7 @@ from pregrasp_jax.heightmap import SEGMENTATION, overhead_camera
 from pregrasp_jax.learning.networks import num_parameters
 from pregrasp_jax.machine import versions
 from pregrasp_jax.robot.base import Robot
+from pregrasp_jax.sensors import get_sensor
 from pregrasp_jax.settings import to_dict
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace
@@ -215,6 +216,7 @@ def _camera(policy: TrainedPolicy) -> CameraEntry:
         looking="straight down, image right = +x, image up = +y",
         depth="metres along the optical axis; no depth is NaN or 0",
         intrinsics="principal point at ((width - 1) / 2, (height - 1) / 2), pixel centres at integers",
+        cell=get_sensor(task.sensor).cell,
     )
 
 

@@ -17,6 +17,9 @@ _TARGET, _STATUS, _WIDTH = 0x0000, 0x010C, 0x0113
 
 _GRIP_WITH_OFFSET, _STOP = 16, 8
 _BUSY, _HELD, _SWITCHES, _SAFETY_ERROR = 1 << 0, 1 << 1, 0b111100, 1 << 6
+_WIDTH_ERROR = 0.004
+"""m; how far from where they were sent the fingers may stand before a push."""
+
 _PERIOD = 0.02
 _BEGINS = 0.3
 """s within which the fingers begin to move, if they have to."""
@@ -79,6 +82,12 @@ class Rg2:
         if not 0.0 <= opening <= 1.0:
             raise DeviceError(f"gripper opening = {opening}; allowed is 0 to 1")
         self._send(opening * self._width)
+        wanted, stands = opening * self._width, self._read(_WIDTH) * 1e-4
+        if abs(stands - wanted) > _WIDTH_ERROR:
+            raise DeviceError(
+                f"the gripper stands {stands * 1e3:.0f} mm open instead of {wanted * 1e3:.0f}; allowed are "
+                f"{_WIDTH_ERROR * 1e3:.0f} mm of difference. Something is in the way of its fingers"
+            )
 
     def grasp(self) -> bool:
         """Close with constant force; return whether something is held."""

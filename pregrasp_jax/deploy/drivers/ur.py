@@ -13,8 +13,17 @@ import numpy as np
 
 from pregrasp_jax.deploy.decision import Push
 from pregrasp_jax.deploy.devices import DeviceError, refuse_missing
-from pregrasp_jax.deploy.guard import START_ERROR, TCP_ERROR, ArmState, Limits, refuse_motion, refuse_pose, refuse_state
-from pregrasp_jax.deploy.poses import grasp_point, tcp_pose
+from pregrasp_jax.deploy.guard import (
+    START_ERROR,
+    START_TURN,
+    TCP_ERROR,
+    ArmState,
+    Limits,
+    refuse_motion,
+    refuse_pose,
+    refuse_state,
+)
+from pregrasp_jax.deploy.poses import angle_between, grasp_point, tcp_pose
 from pregrasp_jax.messages import one_line
 from pregrasp_jax.robot.kinematics import Arm
 from pregrasp_jax.spaces.motion import SETTLE_TIME
@@ -131,12 +140,19 @@ class UrArm:
 
     def push(self, push: Push) -> None:
         """Move along a push; see `ArmDriver.push`."""
-        here = grasp_point(self._arm, self._checked().tcp_pose)
+        pose = self._checked().tcp_pose
+        here = grasp_point(self._arm, pose)
         off = float(np.linalg.norm(here - push.poses[0, :3]))
         if off > START_ERROR:
             raise DeviceError(
                 f"the hand is {off * 1e3:.0f} mm from where the push begins; allowed is {START_ERROR * 1e3:.0f} mm. "
                 "Was it moved by hand? Bring it to the start pose"
+            )
+        turn = angle_between(pose[3:], tcp_pose(self._arm, push.poses[0])[3:])
+        if turn > START_TURN:
+            raise DeviceError(
+                f"the hand is turned by {np.degrees(turn):.0f} degrees from how the push holds it; allowed are "
+                f"{np.degrees(START_TURN):.0f}. A push would turn it on its way. Bring it to the start pose"
             )
         self._move(push.poses[-1])
         time.sleep(SETTLE_TIME)
