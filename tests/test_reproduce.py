@@ -59,7 +59,7 @@ def test_a_size_may_change_a_variant():
     assert tuned["budget"].init_from == "pretrained"
     sizes = {"budget": {**confined.sizes["budget"], "variants": {"tuned": {}}}}
     with pytest.raises(
-        ValueError, match="size budget changes the variant 'tuned'; allowed: as on the open table, from"
+        ValueError, match="size budget changes the variant 'tuned'; allowed: as on the open"
     ):
         experiments.make_spec(dataclasses.replace(confined, sizes=sizes))
 
