@@ -25,9 +25,9 @@ from pregrasp_jax.deploy.build import make_decider
 from pregrasp_jax.deploy.bundle import read_bundle
 from pregrasp_jax.deploy.camera import depth_in_metres
 from pregrasp_jax.deploy.cell import Cell, SimSettings
-from pregrasp_jax.deploy.golden import golden_camera
+from pregrasp_jax.deploy.golden import golden_view
 from pregrasp_jax.deploy.masks import label_image
-from pregrasp_jax.deploy.projection import draw_robot, make_crop, to_maps
+from pregrasp_jax.deploy.projection import draw_robot, to_maps
 
 TIE = 2e-4
 """Values nearer than this are a tie."""
@@ -66,33 +66,31 @@ def measure_parts(bundle: Any, *, threads: int, repetitions: int) -> dict[str, A
     golden, entry = bundle.arrays("golden.npz"), bundle.contract.grid
     runtime = dataclasses.replace(Cell().runtime, threads=threads)
     decider = make_decider(bundle, dataclasses.replace(Cell(), runtime=runtime))
-    camera = golden_camera(golden)
-    crop, joints = make_crop(camera), golden["joint_pos"][-1]
+    view, joints = golden_view(golden), golden["joint_pos"][-1]
     labels = label_image(golden["instances"][-1], int(golden["target_id"][-1]), entry.labels)
-    about = {"camera": camera, "crop": crop}
     robot = {"body": decider.body, "joint_pos": joints, "entry": entry}
 
     def read() -> tuple[np.ndarray, np.ndarray]:
-        metres = depth_in_metres(golden["depth"][-1], scale=float(golden["depth_scale"]), shape=camera.shape)
-        return metres[crop.rows, crop.columns].copy(), labels[crop.rows, crop.columns].copy()
+        metres = depth_in_metres(golden["depth"][-1], scale=float(golden["depth_scale"]), shape=view.camera.shape)
+        return view.cut(metres).copy(), view.cut(labels).copy()
 
     def draw() -> tuple[np.ndarray, np.ndarray]:
         depth, cut = read()
-        draw_robot(depth, cut, **about, **robot)
+        draw_robot(depth, cut, view=view, **robot)
         return depth, cut
 
     drawn = draw()
-    maps, hand = to_maps(*drawn, **about), decider.start()._replace(xy=golden["p1_m"][-1].astype(float))
+    maps, hand = to_maps(*drawn, view=view), decider.start()._replace(xy=golden["p1_m"][-1].astype(float))
     p1 = np.asarray(hand.xy, np.float32)[None]
     push = decider.decide(maps, hand, joints).push
 
     def whole() -> Any:
-        return decider.decide(to_maps(*draw(), **about), hand, joints)
+        return decider.decide(to_maps(*draw(), view=view), hand, joints)
 
     return {
         "reading": times_ms(read, repetitions),
         "reading_and_drawing": times_ms(draw, repetitions),
-        "projection": times_ms(lambda: to_maps(*drawn, **about), repetitions),
+        "projection": times_ms(lambda: to_maps(*drawn, view=view), repetitions),
         "network": times_ms(lambda: decider.values(maps.height_m[None], maps.labels[None], p1), repetitions),
         "reachability_of_one_push": times_ms(lambda: decider.plan(push.action, 0.0, hand, joints), repetitions),
         "decision": times_ms(whole, repetitions),

@@ -63,11 +63,6 @@ class Sensor:
         check_ranges(self, _RANGES)
         return self
 
-    @property
-    def is_exact(self) -> bool:
-        """Whether the image is taken as it is."""
-        return self == Sensor(cell=self.cell, seed=self.seed)
-
 
 _RANGES: dict[str, tuple[float, float]] = {
     "baseline": (0.0, 1.0),

@@ -16,9 +16,9 @@ import numpy as np
 
 from pregrasp_jax import heightmap
 from pregrasp_jax.config import Config
-from pregrasp_jax.deploy.build import make_decider, make_view
+from pregrasp_jax.deploy.build import make_decider, nominal_view
 from pregrasp_jax.deploy.bundle import Bundle
-from pregrasp_jax.deploy.cell import CameraSettings, Cell
+from pregrasp_jax.deploy.cell import Cell
 from pregrasp_jax.deploy.decision import Push
 from pregrasp_jax.deploy.devices import Frame
 from pregrasp_jax.deploy.files import masks_of_ids
@@ -167,14 +167,12 @@ def make_simulated_station(
         raise ValueError(f"sim.scene = {cell.sim.scene} is out of range; allowed is 0 and more")
     decider = make_decider(bundle, cell)
     scene = SimulatedCell(programs or make_programs(bundle, cell), cell.sim.scene)
-    view = make_view(dataclasses.replace(cell, camera=CameraSettings()), decider, Path(), nominal=True)
     return Station(
         decider=decider,
         cell=cell.runtime.cell or bundle.contract.camera.cell,
         log=DecisionLog(log, bundle.contract) if log else None,
         say=say,
-        camera=view.camera,
-        crop=view.crop,
+        view=nominal_view(bundle.contract.camera),
         source=scene,
         segmenter=scene,
         arm=scene,

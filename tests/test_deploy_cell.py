@@ -12,11 +12,11 @@ from PIL import Image
 
 from pregrasp_jax.cli.main import main
 from pregrasp_jax.deploy.bundle import read_bundle
-from pregrasp_jax.deploy.golden import golden_camera
+from pregrasp_jax.deploy.golden import golden_view
 
 BUNDLE = read_bundle(small_bundle())
 GOLDEN = BUNDLE.arrays("golden.npz")
-CAMERA = golden_camera(GOLDEN)
+CAMERA = golden_view(GOLDEN).camera
 ROOT = Path(__file__).parent.parent
 
 

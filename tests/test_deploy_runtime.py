@@ -18,11 +18,12 @@ from pregrasp_jax.deploy.bundle import read_bundle
 from pregrasp_jax.deploy.camera import PinholeCamera, depth_in_metres
 from pregrasp_jax.deploy.decision import Decider, allowed_pushes, workspace_of
 from pregrasp_jax.deploy.files import masks_of_ids, read_masks
-from pregrasp_jax.deploy.golden import golden_camera
+from pregrasp_jax.deploy.golden import golden_view
 from pregrasp_jax.deploy.masks import Masks, Target, from_mask_rcnn, fuse
 from pregrasp_jax.deploy.policy import load_values
-from pregrasp_jax.deploy.projection import Maps, draw_robot, make_crop, project, to_maps
+from pregrasp_jax.deploy.projection import Maps, draw_robot, project, to_maps
 from pregrasp_jax.deploy.tabletop import components
+from pregrasp_jax.deploy.view import make_view
 from pregrasp_jax.geometry import rigid_inverse
 from pregrasp_jax.heightmap.views import project_upward
 from pregrasp_jax.robot import clearance, description, get_robot, kinematics, robot_file
@@ -34,8 +35,8 @@ from pregrasp_jax.types import OBSTRUCTIONS
 ROBOT = get_robot("ur5e_rg2")
 BUNDLE = read_bundle(small_bundle())
 GOLDEN = BUNDLE.arrays("golden.npz")
-CAMERA = golden_camera(GOLDEN)
-CROP = make_crop(CAMERA)
+VIEW = golden_view(GOLDEN)
+CAMERA = VIEW.camera
 BODY = robot_file.from_arrays(BUNDLE.arrays("robot.npz"))
 LABELS = BUNDLE.contract.grid.labels
 WALLED = Workspace(name="walled", walls=(Box(center=(0.0, 0.32, 0.1), half_size=(0.3, 0.02, 0.1), yaw=0.1),))
@@ -139,7 +140,7 @@ def test_projection_is_that_of_the_package(cell: str):
     depth = (1.0 - rng.random(CAMERA.shape) * 0.3).astype(np.float32)
     depth[rng.random(depth.shape) < 0.3] = np.nan
     labels = rng.integers(0, 3, depth.shape).astype(np.uint8)
-    maps = to_maps(depth[CROP.rows, CROP.columns], labels[CROP.rows, CROP.columns], camera=CAMERA, crop=CROP, cell=cell)
+    maps = to_maps(VIEW.cut(depth), VIEW.cut(labels), view=VIEW, cell=cell)
     height, wanted = upward(jnp.asarray(depth), jnp.asarray(labels), cell=cell)
     off = np.abs(maps.height_m - np.asarray(height))
     assert (off <= 1e-5).mean() > 0.997, "but for pixels on the border of two cells"
@@ -157,13 +158,13 @@ def test_projection_is_that_of_the_package(cell: str):
     ],
 )
 def test_what_is_above_the_hand_stays_and_what_is_the_hand_becomes_it(nearer, label, robot):
-    shape, joints = CROP.rays.shape[1:], GOLDEN["joint_pos"][-1]
+    shape, joints = VIEW.rays.shape[1:], GOLDEN["joint_pos"][-1]
     hand, nothing = np.full(shape, np.nan, np.float32), np.full(shape, LABELS["table"], np.uint8)
-    draw_robot(hand, nothing, camera=CAMERA, crop=CROP, body=BODY, joint_pos=joints, entry=BUNDLE.contract.grid)
+    draw_robot(hand, nothing, view=VIEW, body=BODY, joint_pos=joints, entry=BUNDLE.contract.grid)
     covered = nothing == LABELS["robot"]
     assert covered.sum() > 1000
     depth, labels = hand - np.float32(nearer), np.full(shape, LABELS[label], np.uint8)
-    draw_robot(depth, labels, camera=CAMERA, crop=CROP, body=BODY, joint_pos=joints, entry=BUNDLE.contract.grid)
+    draw_robot(depth, labels, view=VIEW, body=BODY, joint_pos=joints, entry=BUNDLE.contract.grid)
     assert (labels[covered] == LABELS["robot" if robot else label]).all()
     np.testing.assert_allclose(depth[covered], hand[covered] - (0 if robot else nearer), atol=1e-6)
 
@@ -176,7 +177,7 @@ def test_the_robot_is_drawn_where_the_package_draws_it():
     blank = np.full(CAMERA.shape, np.nan, np.float32)
     nothing = np.zeros(CAMERA.shape, np.uint8)
     joints = GOLDEN["joint_pos"][-1]
-    about = {"camera": CAMERA, "crop": CROP, "body": BODY, "joint_pos": joints, "entry": BUNDLE.contract.grid}
+    about = {"view": VIEW, "body": BODY, "joint_pos": joints, "entry": BUNDLE.contract.grid}
     drawn = project(blank, nothing, **about)
     height, shown = upward(jnp.where(ids > 0, depth, jnp.nan), ids)
     robot, wanted = drawn.labels == LABELS["robot"], np.asarray(shown) > 0
@@ -189,7 +190,7 @@ def test_an_object_above_the_robot_is_not_painted_over():
     joints = GOLDEN["joint_pos"][-1]
     high = np.full(CAMERA.shape, 0.3, np.float32)  # 0.7 m above the table everywhere
     labels = np.full(CAMERA.shape, LABELS["target"], np.uint8)
-    about = {"camera": CAMERA, "crop": CROP, "body": BODY, "joint_pos": joints, "entry": BUNDLE.contract.grid}
+    about = {"view": VIEW, "body": BODY, "joint_pos": joints, "entry": BUNDLE.contract.grid}
     maps = project(high, labels, **about)
     assert (maps.labels == LABELS["target"]).any() and not (maps.labels == LABELS["robot"]).any()
 
@@ -312,7 +313,7 @@ def test_cameras_that_cannot_be_are_refused():
             camera_at(**changes)
     for position in ((0.5, 0.0, 1.0), (0.0, 0.0, 0.3)):
         with pytest.raises(ValueError, match="does not see the corner"):
-            make_crop(camera_at(position))
+            make_view(camera_at(position))
 
 
 def test_a_bent_lens_is_straightened():

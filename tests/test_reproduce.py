@@ -58,9 +58,7 @@ def test_a_size_may_change_a_variant():
     assert dict(tuned["budget"].settings) == {**tuned["paper"].settings, "learner.learning_rate": 0.0003}
     assert tuned["budget"].init_from == "pretrained"
     sizes = {"budget": {**confined.sizes["budget"], "variants": {"tuned": {}}}}
-    with pytest.raises(
-        ValueError, match="size budget changes the variant 'tuned'; allowed: as on the open"
-    ):
+    with pytest.raises(ValueError, match="size budget changes the variant 'tuned'; allowed: as on the open"):
         experiments.make_spec(dataclasses.replace(confined, sizes=sizes))
 
 

@@ -68,7 +68,7 @@ def calibrate_check(config: Path, /, *, bundle: Path, depth: Path, png: Path = P
         depth: Image of the table, .npy or 16-bit .png; objects may stand on less than half of it.
         png: Picture of how far the table is from where it should be.
     """
-    from pregrasp_jax.deploy.build import make_decider, make_view
+    from pregrasp_jax.deploy.build import make_decider, view_of
     from pregrasp_jax.deploy.calibrate import check_calibration, draw_report
     from pregrasp_jax.deploy.camera import depth_in_metres
     from pregrasp_jax.deploy.files import read_depth
@@ -78,9 +78,9 @@ def calibrate_check(config: Path, /, *, bundle: Path, depth: Path, png: Path = P
     io.refuse_unwritable(png)
     cell = read_cell(config)
     decider = make_decider(read_bundle(bundle), cell)
-    view = make_view(cell, decider, config.parent)
+    view = view_of(cell, decider, config.parent)
     metres = depth_in_metres(read_depth(depth), scale=cell.camera.depth_scale, shape=view.camera.shape)
-    report = check_calibration(metres, camera=view.camera, crop=view.crop, decider=decider)
+    report = check_calibration(metres, view=view, decider=decider)
     print("\n".join(report.lines()))
     save_image(png, draw_report(report))
     print(f"wrote {png}: white is right, red too high, blue too low, grey not seen")

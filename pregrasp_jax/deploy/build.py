@@ -2,14 +2,13 @@
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from pregrasp_jax.deploy.bundle import Bundle
-from pregrasp_jax.deploy.camera import PinholeCamera, optical_from
+from pregrasp_jax.deploy.camera import centred_camera
 from pregrasp_jax.deploy.cell import Cell, camera_of, target_of
 from pregrasp_jax.deploy.contract import ROBOT, CameraEntry
 from pregrasp_jax.deploy.decision import Decider, workspace_of
@@ -20,21 +19,13 @@ from pregrasp_jax.deploy.log import DecisionLog
 from pregrasp_jax.deploy.loop import Station
 from pregrasp_jax.deploy.policy import load_values
 from pregrasp_jax.deploy.poses import on_table
-from pregrasp_jax.deploy.projection import Crop, make_crop
 from pregrasp_jax.deploy.tabletop import TabletopSegmenter
+from pregrasp_jax.deploy.view import View, make_view
 from pregrasp_jax.robot.robot_file import from_arrays
 
 ArmKind = Literal["dry", "ur"]
 GripperKind = Literal["dry", "modbus"]
 Say = Callable[[str], None]
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A camera with the part of its image that counts."""
-
-    camera: PinholeCamera
-    crop: Crop
 
 
 def make_decider(bundle: Bundle, cell: Cell) -> Decider:
@@ -50,25 +41,20 @@ def make_decider(bundle: Bundle, cell: Cell) -> Decider:
     return Decider(contract=bundle.contract, values=values, body=body, workspace=workspace_of(bundle.contract))
 
 
-def nominal_camera(entry: CameraEntry) -> PinholeCamera:
-    """Return the camera of a contract: straight down, its principal point in the middle."""
+def nominal_view(entry: CameraEntry) -> View:
+    """Return the view of a contract's camera, which looks straight down."""
     pose = np.eye(4)
     pose[:3, 3] = entry.position_m
-    centre = (entry.width - 1) / 2, (entry.height - 1) / 2
-    matrix = np.array([[entry.focal_px, 0, centre[0]], [0, entry.focal_px, centre[1]], [0, 0, 1]])
-    shape = (entry.height, entry.width)
-    return PinholeCamera(matrix=matrix, world_from_optical=optical_from(pose, "mujoco"), shape=shape)
+    return make_view(centred_camera(focal_px=entry.focal_px, shape=(entry.height, entry.width), pose=pose))
 
 
-def make_view(cell: Cell, decider: Decider, folder: Path, *, nominal: bool = False) -> View:
-    """Return the camera of a cell; what it leaves out is the contract's only if `nominal`.
+def view_of(cell: Cell, decider: Decider, folder: Path) -> View:
+    """Return the view of a cell's camera.
 
     Raises:
         ValueError: its calibration cannot be used, or it misses the workspace.
     """
-    standard = nominal_camera(decider.contract.camera) if nominal else None
-    camera = camera_of(cell.camera, decider.body.arm, folder, nominal=standard)
-    return View(camera, make_crop(camera))
+    return make_view(camera_of(cell.camera, decider.body.arm, folder))
 
 
 def make_station(
@@ -97,7 +83,7 @@ def make_station(
         DeviceError: a device is not there or not ready.
     """
     decider = make_decider(bundle, cell)
-    view = make_view(cell, decider, folder)
+    view = view_of(cell, decider, folder)
     if not cell.camera.depth:
         raise ValueError("camera.depth is missing in cell.yaml; allowed is the file that the camera's driver writes")
     source = FileSource(
@@ -110,8 +96,7 @@ def make_station(
             cell=cell.runtime.cell or bundle.contract.camera.cell,
             log=DecisionLog(log, bundle.contract) if log else None,
             say=say,
-            camera=view.camera,
-            crop=view.crop,
+            view=view,
             source=source,
             segmenter=_segmenter(cell, decider, view, folder),
             target=target_of(cell),
@@ -155,7 +140,7 @@ def _segmenter(cell: Cell, decider: Decider, view: View, folder: Path) -> Segmen
     settings = cell.segmenter
     if settings.kind == "tabletop":
         entry, scale = decider.contract.grid, cell.camera.depth_scale
-        return TabletopSegmenter(view.camera, view.crop, decider.body, entry, scale=scale)
+        return TabletopSegmenter(view, decider.body, entry, scale=scale)
     if not settings.file:
         raise ValueError("segmenter.file is missing in cell.yaml; allowed is the .npz or .png that the network writes")
     return FileSegmenter(folder / settings.file, min_score=settings.min_score)

@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pregrasp_jax.deploy.camera import PinholeCamera
 from pregrasp_jax.deploy.decision import Decider, action_space, allowed_pushes
-from pregrasp_jax.deploy.projection import Crop
+from pregrasp_jax.deploy.view import View
 from pregrasp_jax.spaces import grid
 
 _INLIER = 0.02
@@ -82,16 +81,15 @@ class CalibrationReport(NamedTuple):
         return all(fine for _, _, fine in self._findings())
 
 
-def check_calibration(depth_m: np.ndarray, *, camera: PinholeCamera, crop: Crop, decider: Decider) -> CalibrationReport:
+def check_calibration(depth_m: np.ndarray, *, view: View, decider: Decider) -> CalibrationReport:
     """Return the numbers for a depth image [rows, columns] m, NaN where there is none.
 
     Raises:
         ValueError: too little of the table is seen to fit a plane.
     """
-    depth = depth_m[crop.rows, crop.columns]
-    place = camera.world_from_optical[:3, 3].astype(np.float32)
-    points = (crop.rays * depth + place[:, None, None]).reshape(3, -1).T
-    of_table = crop.rays * (-place[2] / np.minimum(crop.rays[2], -1e-3)) + place[:, None, None]
+    depth, place = view.cut(depth_m), view.camera.world_from_optical[:3, 3].astype(np.float32)
+    points = (view.rays * depth + place[:, None, None]).reshape(3, -1).T
+    of_table = view.rays * (-place[2] / np.minimum(view.rays[2], -1e-3)) + place[:, None, None]
     looks_at = (np.abs(of_table[:2]) <= grid.WORKSPACE_HALF_SIZE).all(axis=0).ravel()
     known = np.isfinite(points).all(axis=1) & looks_at
     plane, near = _fit(points[known])

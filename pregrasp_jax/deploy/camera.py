@@ -120,6 +120,18 @@ def optical_from(pose: np.ndarray, frame: str) -> np.ndarray:
     return turned
 
 
+def centred_camera(*, focal_px: float, shape: tuple[int, int], pose: np.ndarray) -> PinholeCamera:
+    """Return a camera whose principal point is the middle of its image.
+
+    Args:
+        focal_px: in both directions.
+        shape: (rows, columns).
+        pose: [4, 4] m, of its frame as MuJoCo has it.
+    """
+    matrix = np.array([[focal_px, 0, (shape[1] - 1) / 2], [0, focal_px, (shape[0] - 1) / 2], [0, 0, 1]])
+    return PinholeCamera(matrix=matrix, world_from_optical=optical_from(pose, "mujoco"), shape=shape)
+
+
 def depth_in_metres(depth: np.ndarray, *, scale: float | None, shape: tuple[int, int]) -> np.ndarray:
     """Return a depth image [rows, columns] float32 m with NaN where there is none.
 

@@ -184,36 +184,28 @@ def target_of(cell: Cell) -> Target:
     return Target(index=wanted.index, name=wanted.name, pixel=column_row)
 
 
-def camera_of(
-    settings: CameraSettings, arm: Arm, folder: Path, *, nominal: PinholeCamera | None = None
-) -> PinholeCamera:
+def camera_of(settings: CameraSettings, arm: Arm, folder: Path) -> PinholeCamera:
     """Return the camera.
 
     Args:
         settings: of cell.yaml.
         arm: whose base calibrations may be given in, where it stands in this cell.
         folder: that paths count from.
-        nominal: the contract's, for what is left out.
 
     Raises:
         ValueError: a file or number cannot be used.
     """
-    matrix, shape, distortion = _intrinsics(settings, folder, nominal)
-    if settings.extrinsics is None:
-        if nominal is None:
-            raise ValueError("camera.extrinsics is missing; allowed is a 4 x 4 matrix or the file of a calibration")
-        pose = nominal.world_from_optical
-    else:
-        given = settings.extrinsics
-        pose = read_pose(folder / given) if isinstance(given, str) else np.array(given, float)
-        refuse_pose(pose, what="camera.extrinsics")
-        pose = world_from(settings.parent, arm) @ optical_from(pose, settings.frame)
+    matrix, shape, distortion = _intrinsics(settings, folder)
+    given = settings.extrinsics
+    if given is None:
+        raise ValueError("camera.extrinsics is missing; allowed is a 4 x 4 matrix or the file of a calibration")
+    pose = read_pose(folder / given) if isinstance(given, str) else np.array(given, float)
+    refuse_pose(pose, what="camera.extrinsics")
+    pose = world_from(settings.parent, arm) @ optical_from(pose, settings.frame)
     return PinholeCamera(matrix=matrix, world_from_optical=pose, shape=shape, distortion=distortion)
 
 
-def _intrinsics(
-    settings: CameraSettings, folder: Path, nominal: PinholeCamera | None
-) -> tuple[np.ndarray, tuple[int, int], tuple[float, ...]]:
+def _intrinsics(settings: CameraSettings, folder: Path) -> tuple[np.ndarray, tuple[int, int], tuple[float, ...]]:
     """Return K, (rows, columns) and the distortion."""
     shape = (settings.height, settings.width)
     if isinstance(settings.intrinsics, str):
@@ -229,9 +221,7 @@ def _intrinsics(
             ) from None
         return matrix, shape, distortion or (0.0,) * 5
     if settings.intrinsics is None:
-        if nominal is None:
-            raise ValueError("camera.intrinsics is missing; allowed is K as three rows, or a CameraInfo file")
-        return nominal.matrix, nominal.shape, nominal.distortion
+        raise ValueError("camera.intrinsics is missing; allowed is K as three rows, or a CameraInfo file")
     try:
         return np.array(settings.intrinsics, float).reshape(3, 3), shape, settings.distortion
     except ValueError:

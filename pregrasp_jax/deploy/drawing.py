@@ -5,15 +5,13 @@ hull's projection says which pixels it covers, and on these its nearest face cou
 """
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pregrasp_jax.deploy.camera import PinholeCamera
+from pregrasp_jax.deploy.view import View
 from pregrasp_jax.robot.chain import Links
-
-if TYPE_CHECKING:
-    from pregrasp_jax.deploy.projection import Crop
 
 NEAR = 0.1
 """m; a camera sees nothing nearer."""
@@ -64,18 +62,18 @@ def link_hulls(links: Links, joint_pos: np.ndarray) -> list[WorldHull]:
     return placed
 
 
-def draw_hulls(hulls: list[WorldHull], *, camera: PinholeCamera, crop: "Crop") -> Iterator[DrawnHull]:
+def draw_hulls(hulls: list[WorldHull], view: View) -> Iterator[DrawnHull]:
     """Yield what is seen of every hull that reaches into the cut image. A hull nearer than `NEAR` is not drawn."""
-    corner = np.array([crop.columns.start, crop.rows.start])
-    size = np.array([crop.columns.stop, crop.rows.stop]) - corner
+    corner = np.array([view.columns.start, view.rows.start])
+    size = np.array([view.columns.stop, view.rows.stop]) - corner
     for hull in hulls:
-        pixels, depth = camera.project(hull.vertices)
+        pixels, depth = view.camera.project(hull.vertices)
         pixels = pixels - corner
         if depth.min() < NEAR or (pixels.max(axis=0) < 0).any() or (pixels.min(axis=0) > size - 1).any():
             continue
         rows, columns = _covered(_outline(pixels), size)
         if rows.size:
-            yield DrawnHull(rows, columns, _depth(hull.planes, crop.rays[:, rows, columns], camera))
+            yield DrawnHull(rows, columns, _depth(hull.planes, view.rays[:, rows, columns], view.camera))
 
 
 def _outline(points: np.ndarray) -> np.ndarray:

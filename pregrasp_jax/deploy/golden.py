@@ -3,34 +3,32 @@
 import numpy as np
 
 from pregrasp_jax.deploy.bundle import Bundle
-from pregrasp_jax.deploy.camera import PinholeCamera, depth_in_metres, optical_from
+from pregrasp_jax.deploy.camera import centred_camera, depth_in_metres
 from pregrasp_jax.deploy.contract import ROBOT
 from pregrasp_jax.deploy.masks import label_image
-from pregrasp_jax.deploy.projection import make_crop, project
+from pregrasp_jax.deploy.projection import project
+from pregrasp_jax.deploy.view import View, make_view
 from pregrasp_jax.robot.robot_file import from_arrays
 
 
-def golden_camera(golden: dict[str, np.ndarray]) -> PinholeCamera:
-    """Return the camera of the golden images."""
+def golden_view(golden: dict[str, np.ndarray]) -> View:
+    """Return the view of the golden images."""
     rows, columns = golden["depth"].shape[1:]
-    focal = float(golden["focal_px"])
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = golden["camera_rotation"], golden["camera_position_m"]
-    matrix = np.array([[focal, 0, (columns - 1) / 2], [0, focal, (rows - 1) / 2], [0, 0, 1]])
-    return PinholeCamera(matrix=matrix, world_from_optical=optical_from(pose, "mujoco"), shape=(rows, columns))
+    return make_view(centred_camera(focal_px=float(golden["focal_px"]), shape=(rows, columns), pose=pose))
 
 
 def heightmap_agreement(bundle: Bundle, golden: dict[str, np.ndarray]) -> tuple[float, float]:
     """Return the share of cells whose height is within 1 mm of the package's, and of those with its label."""
-    camera, body = golden_camera(golden), from_arrays(bundle.arrays(ROBOT))
-    crop, entry = make_crop(camera), bundle.contract.grid
+    view, body, entry = golden_view(golden), from_arrays(bundle.arrays(ROBOT)), bundle.contract.grid
     near, same = [], []
     for index in range(len(golden["depth"])):
-        scale, shape = float(golden["depth_scale"]), camera.shape
+        scale, shape = float(golden["depth_scale"]), view.camera.shape
         depth = depth_in_metres(golden["depth"][index], scale=scale, shape=shape)
         labels = label_image(golden["instances"][index], int(golden["target_id"][index]), entry.labels)
         joints = golden["joint_pos"][index]
-        maps = project(depth, labels, camera=camera, crop=crop, body=body, joint_pos=joints, entry=entry)
+        maps = project(depth, labels, view=view, body=body, joint_pos=joints, entry=entry)
         near.append((np.abs(maps.height_m - golden["seen_height_m"][index]) <= 1e-3).mean())
         same.append((maps.labels == golden["seen_labels"][index]).mean())
     return float(np.mean(near)), float(np.mean(same))

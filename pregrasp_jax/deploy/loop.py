@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pregrasp_jax.deploy.camera import PinholeCamera, depth_in_metres
+from pregrasp_jax.deploy.camera import depth_in_metres
 from pregrasp_jax.deploy.decision import Decider, Decision
 from pregrasp_jax.deploy.devices import ArmDriver, Frame, GripperDriver, ImageSource, Segmenter
 from pregrasp_jax.deploy.log import DecisionLog
 from pregrasp_jax.deploy.masks import Target, fuse
-from pregrasp_jax.deploy.projection import Crop, Maps, draw_robot, to_maps
+from pregrasp_jax.deploy.projection import Maps, draw_robot, to_maps
+from pregrasp_jax.deploy.view import View
 from pregrasp_jax.spaces import motion
 
 LIFT_HEIGHT = 0.2
@@ -55,8 +56,7 @@ class Station:
 
     Attributes:
         decider: the policy.
-        camera: as calibrated.
-        crop: of its image.
+        view: of its camera.
         source: of images.
         segmenter: of their objects.
         target: which of them is wanted.
@@ -69,8 +69,7 @@ class Station:
     """
 
     decider: Decider
-    camera: PinholeCamera
-    crop: Crop
+    view: View
     source: ImageSource
     segmenter: Segmenter
     target: Target
@@ -123,15 +122,14 @@ class Station:
         target = self.target.find(masks)
         clock.lap("segmentation")
         entry = self.decider.contract.grid
-        labels = fuse(masks, target, entry.labels, self.camera.shape)
-        metres = depth_in_metres(frame.depth, scale=self.depth_scale, shape=self.camera.shape)
-        depth, cut = (image[self.crop.rows, self.crop.columns].copy() for image in (metres, labels))
+        labels = fuse(masks, target, entry.labels, self.view.camera.shape)
+        metres = depth_in_metres(frame.depth, scale=self.depth_scale, shape=self.view.camera.shape)
+        depth, cut = (self.view.cut(image).copy() for image in (metres, labels))
         clock.lap("reading")
-        geometry = {"camera": self.camera, "crop": self.crop}
         joints = frame.joint_pos
-        draw_robot(depth, cut, **geometry, body=self.decider.body, joint_pos=joints, entry=entry)
+        draw_robot(depth, cut, view=self.view, body=self.decider.body, joint_pos=joints, entry=entry)
         clock.lap("drawing")
-        maps = to_maps(depth, cut, **geometry, cell=self.cell)
+        maps = to_maps(depth, cut, view=self.view, cell=self.cell)
         clock.lap("projection")
         decision = self.decider.decide(maps, hand, joints, lap=clock.lap)
         clock.lap("decoding")

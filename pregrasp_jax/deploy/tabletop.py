@@ -8,11 +8,12 @@ from collections import deque
 
 import numpy as np
 
-from pregrasp_jax.deploy.camera import PinholeCamera, depth_in_metres
+from pregrasp_jax.deploy.camera import depth_in_metres
 from pregrasp_jax.deploy.contract import GridEntry
 from pregrasp_jax.deploy.devices import Frame
 from pregrasp_jax.deploy.masks import Masks
-from pregrasp_jax.deploy.projection import Crop, cells_of, project
+from pregrasp_jax.deploy.projection import cells_of, project
+from pregrasp_jax.deploy.view import View
 from pregrasp_jax.robot.following import Body
 
 MIN_HEIGHT = 0.03
@@ -28,21 +29,20 @@ _MIN_CELLS = 12
 class TabletopSegmenter:
     """Components of a heightmap, as masks of the image."""
 
-    def __init__(self, camera: PinholeCamera, crop: Crop, body: Body, entry: GridEntry, *, scale: float | None = None):
-        self._camera, self._crop, self._body, self._entry, self._scale = camera, crop, body, entry, scale
+    def __init__(self, view: View, body: Body, entry: GridEntry, *, scale: float | None = None):
+        self._view, self._body, self._entry, self._scale = view, body, entry, scale
 
     def segment(self, frame: Frame) -> Masks:
         """Return one mask per component, the largest first; they are called 0, 1, 2, ..."""
-        depth = depth_in_metres(frame.depth, scale=self._scale, shape=self._camera.shape)
+        depth = depth_in_metres(frame.depth, scale=self._scale, shape=self._view.camera.shape)
         blank = np.zeros(depth.shape, np.uint8)
-        geometry = {"camera": self._camera, "crop": self._crop}
-        maps = project(depth, blank, **geometry, body=self._body, joint_pos=frame.joint_pos, entry=self._entry)
+        maps = project(depth, blank, view=self._view, body=self._body, joint_pos=frame.joint_pos, entry=self._entry)
         standing = (maps.height_m > MIN_HEIGHT) & (maps.labels != self._entry.labels["robot"])
         parts = components(maps.height_m, standing)
-        cells = cells_of(depth[self._crop.rows, self._crop.columns], **geometry)
+        cells = cells_of(self._view.cut(depth), self._view)
         masks = np.zeros((len(parts), *depth.shape), bool)
         for mask, part in zip(masks, parts, strict=True):
-            mask[self._crop.rows, self._crop.columns] = np.append(part.ravel(), False)[cells]
+            self._view.cut(mask)[:] = np.append(part.ravel(), False)[cells]
         sizes = np.array([part.sum() for part in parts], float)
         return Masks(masks, tuple(map(str, range(len(parts)))), sizes / max(sizes.max(initial=0.0), 1.0))
 
