@@ -206,3 +206,13 @@ def test_openvino_agrees():
     program = core.compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
     q = program({name: golden[name] for name in onnx_policy.INPUTS})[program.output(0)]
     assert np.abs(q - golden["q"]).max() <= 1e-4
+
+
+def test_the_contract_says_which_point_above_a_cell_counts(tmp_path: Path):
+    (tmp_path / "coarse.yaml").write_text("cell: median\n")
+    for sensor, cell in (("clean", "max"), (str(tmp_path / "coarse.yaml"), "median")):
+        task = TaskConfig(camera="pinhole", sensor=sensor)
+        config = Config(network=NetworkConfig(architecture="compact", width=1 / 32), task=task)
+        folder = tmp_path / cell
+        export_policy(random_policy(folder / "policy", config), folder / "bundle", golden=2)
+        assert read_bundle(folder / "bundle").contract.camera.cell == cell
