@@ -13,10 +13,11 @@ import argparse
 import json
 import sys
 
-from pregrasp_jax.config import AssetsConfig, EvaluationConfig, PhysicsConfig, SceneConfig, TaskOverrides
+from pregrasp_jax.config import AssetsConfig, PhysicsConfig, SceneConfig
 from pregrasp_jax.evaluation.clearing import Cleared, clear_scenes, own_protocol, summary
 from pregrasp_jax.evaluation.player import make_player
 from pregrasp_jax.evaluation.statistics import mcnemar_exact
+from pregrasp_jax.evaluation_config import EvaluationConfig, TaskOverrides
 
 
 def paired(a: list[Cleared], b: list[Cleared]) -> dict[str, float]:

@@ -28,8 +28,8 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from pregrasp_jax import heightmap
-from pregrasp_jax.config import PRESETS
 from pregrasp_jax.policies.exploration import draw_choice
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.task.primitive import Plan

@@ -19,9 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pregrasp_jax.config import PRESETS, AssetsConfig
+from pregrasp_jax.config import AssetsConfig
 from pregrasp_jax.physics import native
 from pregrasp_jax.physics.mjx_model import make_reference_model
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.robot.description import palm_to_grasp_point
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.task.env import Env, make_env

@@ -22,8 +22,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.config import Config
 from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.training import collect

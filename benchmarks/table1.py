@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from pregrasp_jax import io
-from pregrasp_jax.config import AssetsConfig, EvaluationConfig, PhysicsConfig, TaskOverrides
+from pregrasp_jax.config import AssetsConfig, PhysicsConfig
 from pregrasp_jax.evaluation import load_evaluation
 from pregrasp_jax.evaluation.player import make_player, run_evaluation
+from pregrasp_jax.evaluation_config import EvaluationConfig, TaskOverrides
 from pregrasp_jax.policies.ppg import STROKE_SCRIPTS
 
 BUILTIN = ("seen", "unseen")

@@ -24,9 +24,10 @@ import tyro
 from timing import best_ms
 
 from pregrasp_jax.checkpoint.state import save
-from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.config import Config
 from pregrasp_jax.learning import learner, replay
 from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.task.env import make_env
 from pregrasp_jax.training.program import POLICY, Program, TrainState, make_program
 

@@ -18,11 +18,12 @@ import numpy as np
 import tyro
 
 from pregrasp_jax.checkpoint import load_policy, save_policy
-from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.config import Config
 from pregrasp_jax.evaluation import EvaluationResult, evaluate_policy
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.policies.exploration import random_action
 from pregrasp_jax.policies.learned import make_learned
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.task.env import Env, make_env
 from pregrasp_jax.training.program import make_program
 from pregrasp_jax.types import REASONS

@@ -1,4 +1,4 @@
-"""Every setting of a run: one frozen dataclass per stage, and the presets.
+"""Every setting of a run: one frozen dataclass per stage.
 
 The docstring under a field is its command-line help. `Config.validate` is called wherever a config enters
 the program, so that a value out of range is one line before anything compiles.
@@ -313,86 +313,6 @@ class Config:
         return self
 
 
-@dataclass(frozen=True, kw_only=True)
-class TaskOverrides:
-    """What an evaluation may change of the task that a policy was trained for; null keeps it."""
-
-    workspace: str | None = None
-    """Where: `table`, `shelf`, `narrow` or another name in `spaces.workspace.WORKSPACES` (docs/confined.md)."""
-    place: PlaceConfig = field(default_factory=PlaceConfig)
-    mirrored_start: bool | None = None
-    """Between walls, start in the mirror image of the arm's posture if the target lies on the right (y < 0)."""
-    robot: str | None = None
-    """Who, for scripts: a name in `robot.ROBOTS`. A trained policy knows one robot only."""
-    primitive: str | None = None
-    """Does what, for scripts: a name in `task.registry.KINDS`."""
-    camera: CameraName | None = None
-    """What the policy sees through (`orthographic` for scripts)."""
-    sensor: str | None = None
-    """What that camera, the masks and the objects get wrong: clean, d435, d455, or a .yaml file. Needs `pinhole`."""
-    r_out: float | None = None
-    """m, outer radius of the half ring."""
-    obstacles_may_leave: bool = False
-    """True counts failures as the paper does: an obstacle may leave the workspace, and stands beside it then."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class StrokesOverrides:
-    """What an evaluation may change of how Target-PPG plays; null keeps what its policy was trained with."""
-
-    mask_radius: float | None = None
-    """m; only strokes that begin so near to the target; 0 considers all."""
-    free_space: FreeSpace | None = None
-    """When it reaches for the target: once a stroke can take it and nothing else, or (`cluster`) once nothing stands
-    within 10 mm of it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlanningConfig:
-    """A search in a scene that is rebuilt from the camera's pictures, see docs/planning.md."""
-
-    budget_ms: float = 0.0
-    """ms for a decision: no round of simulations begins that would exceed it. 0 sets no limit, and results repeat."""
-    candidates: int = 10
-    """Pushes that the network proposes, 2 cm apart; scripts add to them up to 16."""
-    variants: int = 3
-    """Rebuilt scenes in which a push is tried; all but the first have disturbed poses, sizes and masses."""
-    depth: int = 2
-    """Pushes of the network that may follow a candidate."""
-
-    def validate(self) -> "PlanningConfig":
-        """Return self.
-
-        Raises:
-            ValueError: a value is outside its range; one line names the key, the value and the range.
-        """
-        check_ranges(self, _PLANNING_RANGES, "planning.")
-        return self
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluationConfig:
-    """One evaluation."""
-
-    policy: str
-    """random, guided, straight, clear, lookahead, pretrained, or a run folder; of a run of the preset `ppg` also
-    target-ppg:FOLDER, and untrained strokes or target-strokes (docs/baselines.md)."""
-    assets: AssetsConfig = field(default_factory=AssetsConfig)
-    scene: SceneConfig = field(default_factory=SceneConfig)
-    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
-    task: TaskOverrides = field(default_factory=TaskOverrides)
-    strokes: StrokesOverrides = field(default_factory=StrokesOverrides)
-    plan: bool = False
-    """Let a trained policy search in a rebuilt scene before every push."""
-    planning: PlanningConfig = field(default_factory=PlanningConfig)
-    episodes: int = 100
-    """Test scenes to run, from the first; all policies meet the same."""
-    seed: int = 0
-    """Seed of the policy's own randomness; scenes, yaws and targets are fixed."""
-    num_envs: int = 0
-    """Scenes side by side, 0 chooses; with `native` results do not depend on it."""
-
-
 _RANGES: dict[str, tuple[float, float]] = {
     "seed": (0, 2**32 - 1),
     "assets.variants": (0, 10_000),
@@ -457,57 +377,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "train.log_every": (1, 1_000_000_000),
     "train.fused_iterations": (0, 1_000_000),
 }
-
-_PLANNING_RANGES: dict[str, tuple[float, float]] = {
-    "budget_ms": (0.0, 600_000.0),
-    "candidates": (1, 64),
-    "variants": (1, 8),
-    "depth": (0, 8),
-}
-
-_CPU = Config(
-    scene=SceneConfig(validation_scenes=100),
-    network=NetworkConfig(architecture="compact", width=0.25, initial_bias=0.5, mirror=True),
-    replay=ReplayConfig(capacity=100_000, importance_fraction=0.8),
-    learner=LearnerConfig(
-        learning_rate=1e-3,
-        final_learning_rate=2e-5,
-        learning_rate_fraction=0.8,
-        polyak=0.995,
-        huber_delta=1.0,
-        updates_per_step=2.0,
-    ),
-    exploration=ExplorationConfig(epsilon_fraction=0.16, branches=3),
-    train=TrainConfig(num_envs=16, episodes=25_000, minutes=150.0, evaluate_every=2_500),
-)
-
-PRESETS: dict[str, Config] = {
-    "ci": Config(
-        scene=SceneConfig(train_scenes=4, validation_scenes=2, test_scenes=2),
-        network=NetworkConfig(width=0.0625),
-        replay=ReplayConfig(capacity=256, importance_steps=200),
-        learner=LearnerConfig(batch_size=4, warmup=8, updates_per_step=0.5, learning_rate_steps=0),
-        exploration=ExplorationConfig(epsilon_decay=64),
-        train=TrainConfig(num_envs=2, episodes=1_000_000, minutes=1.0, evaluate_every=0, log_every=2),
-    ),
-    "demo": dataclasses.replace(
-        _CPU,
-        scene=SceneConfig(train_scenes=64, validation_scenes=10, test_scenes=50),
-        replay=ReplayConfig(capacity=10_000, importance_fraction=1.0),
-        learner=dataclasses.replace(_CPU.learner, final_learning_rate=1e-4, learning_rate_fraction=1.0),
-        exploration=dataclasses.replace(_CPU.exploration, epsilon_fraction=1.0),
-        train=TrainConfig(num_envs=16, episodes=2_000, minutes=5.0, evaluate_every=0),
-    ),
-    "cpu": _CPU,
-    "paper": Config(),
-    "ppg": Config(
-        task=TaskConfig(robot="barrett", primitive="push_grasp"),
-        strokes=StrokesConfig(positives=5_000),
-        train=TrainConfig(method="imitation"),
-    ),
-}
-"""`ci`: 2 scenes, a minute, for tests. `demo`: minutes, shows every part. `cpu`: two cores, 150 minutes.
-`paper`: width 1.0, 45 K episodes, as published. `ppg`: a baseline of the paper, another hand and method."""
 
 
 def with_absolute_paths(config: Config) -> Config:

@@ -20,7 +20,8 @@ from pregrasp_jax import io
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.formats import MAX_BYTES
 from pregrasp_jax.checkpoint import Ring, save, save_policy, trees, write_config
-from pregrasp_jax.config import PRESETS, ReplayConfig, TaskConfig
+from pregrasp_jax.config import ReplayConfig, TaskConfig
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.spaces.workspace import TABLE
 from pregrasp_jax.training.dump import make_dump
 from pregrasp_jax.training.mishap import no_mishap

@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 from fake_env import ACTIONS, FakeEnv
 
-from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.config import Config
 from pregrasp_jax.learning.q_function import QFunction
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.settings import to_dict
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.task.primitive import Plan

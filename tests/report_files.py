@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.config import PRESETS
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.report import Film, Step
 from pregrasp_jax.settings import to_dict
 

@@ -11,7 +11,8 @@ import pytest
 
 from pregrasp_jax.checkpoint import chunks, policy, read_config, state, trees, write_config
 from pregrasp_jax.checkpoint.chunks import Ring
-from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.config import Config
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.training.program import POLICY
 
 CAPACITY = 10

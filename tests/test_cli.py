@@ -23,11 +23,13 @@ from pregrasp_jax.cli import commands, doctor, progress
 from pregrasp_jax.cli import evaluate as evaluate_module
 from pregrasp_jax.cli.evaluate import evaluate
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.config import PRESETS, AssetsConfig, Config, PhysicsConfig, SceneConfig, TaskConfig, TaskOverrides
+from pregrasp_jax.config import AssetsConfig, Config, PhysicsConfig, SceneConfig, TaskConfig
 from pregrasp_jax.evaluation import player
 from pregrasp_jax.evaluation.player import EvaluationConfig, make_player, run_evaluation
+from pregrasp_jax.evaluation_config import TaskOverrides
 from pregrasp_jax.learning.networks import QNetwork
 from pregrasp_jax.physics import mjx_version
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.report import play as report_play
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.training import resources

@@ -10,7 +10,7 @@ import pytest
 from fake_env import ACTIONS, hand_at
 
 from pregrasp_jax import heightmap
-from pregrasp_jax.config import PRESETS, NetworkConfig, TaskConfig
+from pregrasp_jax.config import NetworkConfig, TaskConfig
 from pregrasp_jax.learning.compact import (
     PATCH,
     CompactNetwork,
@@ -23,6 +23,7 @@ from pregrasp_jax.learning.compact import (
 )
 from pregrasp_jax.learning.networks import num_parameters
 from pregrasp_jax.learning.q_function import QFunction, make_q_function
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace, Choice
 from pregrasp_jax.types import Observation

@@ -9,7 +9,8 @@ import yaml
 
 from pregrasp_jax import config as config_module
 from pregrasp_jax.checkpoint import read_config, write_config
-from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.config import Config
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.settings import difference, to_dict
 
 

@@ -12,8 +12,9 @@ from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.checkpoint.chunks import Ring
 from pregrasp_jax.checkpoint.state import save
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.config import PRESETS, StrokesConfig
+from pregrasp_jax.config import StrokesConfig
 from pregrasp_jax.evaluation.clearing import Cleared, summary
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.task.push_grasp import stroke_actions
 from pregrasp_jax.training import imitation
 from pregrasp_jax.training.imitation import copy_positives, split

@@ -13,6 +13,7 @@ ORDER = [
     ["io"],
     ["settings", "spaces", "types", "yaml_file"],
     ["config", "geometry", "machine", "sensors", "startup"],
+    ["evaluation_config", "presets"],
     ["assets"],
     ["robot"],
     ["scene"],

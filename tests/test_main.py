@@ -10,7 +10,8 @@ import pytest
 import pregrasp_jax
 from pregrasp_jax.cli import main as program
 from pregrasp_jax.cli.main import COMMANDS, Command, main
-from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.config import Config
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.training import run_folder, session
 
 ROOT = Path(__file__).parent.parent

@@ -16,12 +16,13 @@ from fake_env import ACTIONS
 from fake_training import TinyNetwork, input_fn
 
 from pregrasp_jax.assets.catalogue import builtin_bank
-from pregrasp_jax.config import PRESETS, Config, SceneConfig
+from pregrasp_jax.config import Config, SceneConfig
 from pregrasp_jax.evaluation import Evaluator
 from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.physics import mjx, native
 from pregrasp_jax.physics.base import Engine
 from pregrasp_jax.policies import scripts
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses

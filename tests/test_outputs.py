@@ -11,8 +11,8 @@ from pregrasp_jax import drawing
 from pregrasp_jax.cli import commands, replay, report
 from pregrasp_jax.cli.evaluate import evaluate
 from pregrasp_jax.cli.outputs import refuse_unwritable
-from pregrasp_jax.config import EvaluationConfig
 from pregrasp_jax.drawing import files
+from pregrasp_jax.evaluation_config import EvaluationConfig
 
 FRAMES = [np.full((21, 35, 3), color, np.uint8) for color in ((200, 40, 20), (20, 180, 60), (40, 60, 220))]
 """Of odd height and width, which H.264 does not know."""

@@ -16,11 +16,12 @@ import pytest
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.config import EvaluationConfig, PlanningConfig, SceneConfig
+from pregrasp_jax.config import SceneConfig
 from pregrasp_jax.evaluation import format_evaluation, load_evaluation
 from pregrasp_jax.evaluation.deliberation import Deliberation
 from pregrasp_jax.evaluation.player import make_player, run_evaluation
 from pregrasp_jax.evaluation.statistics import compare
+from pregrasp_jax.evaluation_config import EvaluationConfig, PlanningConfig
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.planning import search as searching
 from pregrasp_jax.planning.memory import NOTHING, Sight

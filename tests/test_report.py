@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from report_files import ROWS, evaluation_row, log_row, run_main, write_evaluation, write_run
 
-from pregrasp_jax.config import PRESETS
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.report import build_page, load_evaluations, read_run
 from pregrasp_jax.report.charts import duration, failure_figures, learning_figures, time_figures
 from pregrasp_jax.report.results import SCRIPTS, is_of_run, missing

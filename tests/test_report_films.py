@@ -18,9 +18,9 @@ from pregrasp_jax.cli import demo as demo_module
 from pregrasp_jax.cli import report as report_module
 from pregrasp_jax.cli.main import main
 from pregrasp_jax.cli.report import report, report_session
-from pregrasp_jax.config import PRESETS
 from pregrasp_jax.evaluation import player
 from pregrasp_jax.learning.networks import QNetwork
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.report.play import SECONDS_PER_FRAME
 
 LONG = [evaluation_row(300, report_module.WORTH_FILMS, 0.75, [0.5, 0.9])]

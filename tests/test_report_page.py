@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from report_files import HOSTILE, ROWS, log_row, make_films, write_evaluation, write_run
 
-from pregrasp_jax.config import PRESETS
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.report import load_evaluations, read_run, write_report
 from pregrasp_jax.report.films import data_uri
 from pregrasp_jax.settings import to_dict

@@ -13,7 +13,8 @@ import pytest
 from fake_training import make_config, rows, run, stop_after, timeless
 
 from pregrasp_jax import io
-from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.config import Config
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.settings import to_dict
 from pregrasp_jax.training import learn, schedules
 

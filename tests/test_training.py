@@ -23,8 +23,9 @@ from fake_training import (
 )
 
 from pregrasp_jax.checkpoint import checksum, load_policy
-from pregrasp_jax.config import PRESETS, Config, ExplorationConfig
+from pregrasp_jax.config import Config, ExplorationConfig
 from pregrasp_jax.learning import learner
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.settings import to_dict
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training import collect, learn

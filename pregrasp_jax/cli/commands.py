@@ -14,20 +14,13 @@ from pregrasp_jax.assets.sets import format_table
 from pregrasp_jax.assets.variants import variant_bank
 from pregrasp_jax.cli import doctor as machine_doctor
 from pregrasp_jax.cli.outputs import refuse_unwritable
-from pregrasp_jax.config import (
-    AssetsConfig,
-    Config,
-    EvaluationConfig,
-    ObjectSet,
-    SceneConfig,
-    TaskConfig,
-    TaskOverrides,
-)
+from pregrasp_jax.config import AssetsConfig, Config, ObjectSet, SceneConfig, TaskConfig
 from pregrasp_jax.drawing import contact_sheet, save_image
 from pregrasp_jax.evaluation import load_evaluation
 from pregrasp_jax.evaluation.player import make_player
 from pregrasp_jax.evaluation.statistics import compare as compare_evaluations
 from pregrasp_jax.evaluation.statistics import format_comparison
+from pregrasp_jax.evaluation_config import EvaluationConfig, TaskOverrides
 from pregrasp_jax.report.play import draw_decision, draw_scenes
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene.bank import SPLITS, SceneBank

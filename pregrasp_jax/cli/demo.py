@@ -10,10 +10,12 @@ from typing import Any
 from pregrasp_jax import io
 from pregrasp_jax.cli.progress import EpisodeProgress
 from pregrasp_jax.cli.report import FILMS, describe_films, make_film, play_films, write_page
-from pregrasp_jax.config import PRESETS, EvaluationConfig, SceneConfig
+from pregrasp_jax.config import SceneConfig
 from pregrasp_jax.drawing import save_film
 from pregrasp_jax.evaluation import format_evaluations
 from pregrasp_jax.evaluation.player import Player, make_player, run_evaluation
+from pregrasp_jax.evaluation_config import EvaluationConfig
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.report import read_run, write_films
 from pregrasp_jax.report.play import SECONDS_PER_FRAME, draw_tiles, make_panel, make_play
 from pregrasp_jax.report.results import EVALUATIONS

@@ -6,7 +6,7 @@ from typing import Annotated
 import tyro
 
 from pregrasp_jax import io
-from pregrasp_jax.config import EvaluationConfig
+from pregrasp_jax.evaluation_config import EvaluationConfig
 
 ALIASES = {
     "--object-dir": "--assets.object-dir",

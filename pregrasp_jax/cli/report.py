@@ -8,10 +8,11 @@ from pathlib import Path
 from pregrasp_jax.checkpoint import TrainedPolicy, checksum, load_policy
 from pregrasp_jax.checkpoint.state import exists
 from pregrasp_jax.cli.outputs import refuse_unwritable
-from pregrasp_jax.config import AssetsConfig, EvaluationConfig
+from pregrasp_jax.config import AssetsConfig
 from pregrasp_jax.evaluation import load_evaluation
 from pregrasp_jax.evaluation.player import Player, make_player
 from pregrasp_jax.evaluation.runner import Decision
+from pregrasp_jax.evaluation_config import EvaluationConfig
 from pregrasp_jax.report import Film, RunRecord, Step, load_evaluations, read_run, write_report
 from pregrasp_jax.report.page import REPORT, kept_episodes
 from pregrasp_jax.report.play import Tiles, describe_decision, draw_tiles, make_play

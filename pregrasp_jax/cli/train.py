@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.config import Config
+from pregrasp_jax.presets import PRESETS
 
 Session = Callable[[], int]
 """Trains and returns the exit code."""

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 import jax
 
 from pregrasp_jax.checkpoint import TrainedPolicy
-from pregrasp_jax.config import Config, EvaluationConfig
+from pregrasp_jax.config import Config
+from pregrasp_jax.evaluation_config import EvaluationConfig
 from pregrasp_jax.learning.imitation import StrokeFunction
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.planning.planner import Planner

@@ -12,18 +12,9 @@ import jax
 
 from pregrasp_jax.checkpoint import TrainedPolicy, load_policy
 from pregrasp_jax.checkpoint.policy import PPG
-from pregrasp_jax.config import (
-    STYLES,
-    Config,
-    EvaluationConfig,
-    PlaceConfig,
-    PlanningConfig,
-    StrokesOverrides,
-    TaskConfig,
-    TaskOverrides,
-    with_absolute_paths,
-)
+from pregrasp_jax.config import STYLES, Config, PlaceConfig, TaskConfig, with_absolute_paths
 from pregrasp_jax.evaluation import EpisodeCallback, Evaluator, evaluation_document, learned
+from pregrasp_jax.evaluation_config import EvaluationConfig, PlanningConfig, StrokesOverrides, TaskOverrides
 from pregrasp_jax.machine import announced_compilation
 from pregrasp_jax.planning.planner import Planner
 from pregrasp_jax.policies import scripts

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from pregrasp_jax.config import PlanningConfig
+from pregrasp_jax.evaluation_config import PlanningConfig
 from pregrasp_jax.heightmap import overhead_camera, robot_hulls
 from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.planning import memory as remembering

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from pregrasp_jax.config import PlanningConfig
+from pregrasp_jax.evaluation_config import PlanningConfig
 from pregrasp_jax.planning.rollout import Rollout
 from pregrasp_jax.types import EnvState, HullBank
 

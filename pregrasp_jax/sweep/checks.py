@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pregrasp_jax.config import EvaluationConfig
+from pregrasp_jax.evaluation_config import EvaluationConfig
 from pregrasp_jax.settings import from_dict, to_dict
 from pregrasp_jax.spaces.workspace import WORKSPACES, get_workspace
 from pregrasp_jax.sweep import parameters

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pregrasp_jax import yaml_file
-from pregrasp_jax.config import PRESETS
 from pregrasp_jax.messages import lookup
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.settings import from_dict
 from pregrasp_jax.sweep.parameters import Parameter, read_parameter
 

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from pregrasp_jax import io
-from pregrasp_jax.config import PRESETS, Config
+from pregrasp_jax.config import Config
+from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.settings import to_dict
 from pregrasp_jax.sweep.spec import Spec
 

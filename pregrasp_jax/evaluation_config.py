@@ -1,0 +1,97 @@
+"""What an evaluation is told: who plays, on which objects and scenes, and what it changes of the task.
+
+The docstring under a field is its command-line help, as in `config`.
+"""
+
+from dataclasses import dataclass, field
+
+from pregrasp_jax.config import AssetsConfig, CameraName, FreeSpace, PhysicsConfig, PlaceConfig, SceneConfig
+from pregrasp_jax.settings import check_ranges
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskOverrides:
+    """What an evaluation may change of the task that a policy was trained for; null keeps it."""
+
+    workspace: str | None = None
+    """Where: `table`, `shelf`, `narrow` or another name in `spaces.workspace.WORKSPACES` (docs/confined.md)."""
+    place: PlaceConfig = field(default_factory=PlaceConfig)
+    mirrored_start: bool | None = None
+    """Between walls, start in the mirror image of the arm's posture if the target lies on the right (y < 0)."""
+    robot: str | None = None
+    """Who, for scripts: a name in `robot.ROBOTS`. A trained policy knows one robot only."""
+    primitive: str | None = None
+    """Does what, for scripts: a name in `task.registry.KINDS`."""
+    camera: CameraName | None = None
+    """What the policy sees through (`orthographic` for scripts)."""
+    sensor: str | None = None
+    """What that camera, the masks and the objects get wrong: clean, d435, d455, or a .yaml file. Needs `pinhole`."""
+    r_out: float | None = None
+    """m, outer radius of the half ring."""
+    obstacles_may_leave: bool = False
+    """True counts failures as the paper does: an obstacle may leave the workspace, and stands beside it then."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StrokesOverrides:
+    """What an evaluation may change of how Target-PPG plays; null keeps what its policy was trained with."""
+
+    mask_radius: float | None = None
+    """m; only strokes that begin so near to the target; 0 considers all."""
+    free_space: FreeSpace | None = None
+    """When it reaches for the target: once a stroke can take it and nothing else, or (`cluster`) once nothing stands
+    within 10 mm of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanningConfig:
+    """A search in a scene that is rebuilt from the camera's pictures, see docs/planning.md."""
+
+    budget_ms: float = 0.0
+    """ms for a decision: no round of simulations begins that would exceed it. 0 sets no limit, and results repeat."""
+    candidates: int = 10
+    """Pushes that the network proposes, 2 cm apart; scripts add to them up to 16."""
+    variants: int = 3
+    """Rebuilt scenes in which a push is tried; all but the first have disturbed poses, sizes and masses."""
+    depth: int = 2
+    """Pushes of the network that may follow a candidate."""
+
+    def validate(self) -> "PlanningConfig":
+        """Return self.
+
+        Raises:
+            ValueError: a value is outside its range; one line names the key, the value and the range.
+        """
+        check_ranges(self, _PLANNING_RANGES, "planning.")
+        return self
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig:
+    """One evaluation."""
+
+    policy: str
+    """random, guided, straight, clear, lookahead, pretrained, or a run folder; of a run of the preset `ppg` also
+    target-ppg:FOLDER, and untrained strokes or target-strokes (docs/baselines.md)."""
+    assets: AssetsConfig = field(default_factory=AssetsConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    task: TaskOverrides = field(default_factory=TaskOverrides)
+    strokes: StrokesOverrides = field(default_factory=StrokesOverrides)
+    plan: bool = False
+    """Let a trained policy search in a rebuilt scene before every push."""
+    planning: PlanningConfig = field(default_factory=PlanningConfig)
+    episodes: int = 100
+    """Test scenes to run, from the first; all policies meet the same."""
+    seed: int = 0
+    """Seed of the policy's own randomness; scenes, yaws and targets are fixed."""
+    num_envs: int = 0
+    """Scenes side by side, 0 chooses; with `native` results do not depend on it."""
+
+
+_PLANNING_RANGES: dict[str, tuple[float, float]] = {
+    "budget_ms": (0.0, 600_000.0),
+    "candidates": (1, 64),
+    "variants": (1, 8),
+    "depth": (0, 8),
+}
