@@ -48,7 +48,7 @@ def main() -> None:
         player = make_player(request, say=lambda line: print(line, file=sys.stderr))
         found[policy] = clear_scenes(
             own_protocol(player.env),
-            player.policy,
+            player.policy,  # pyright: ignore[reportArgumentType]
             scenes=arguments.scenes,
             progress=lambda done, total, name=policy: print(f"{name}: {done} of {total}", file=sys.stderr),
         )

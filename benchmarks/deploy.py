@@ -83,6 +83,7 @@ def measure_parts(bundle: Any, *, threads: int, repetitions: int) -> dict[str, A
     maps, hand = to_maps(*drawn, view=view), decider.start()._replace(xy=golden["p1_m"][-1].astype(float))
     p1 = np.asarray(hand.xy, np.float32)[None]
     push = decider.decide(maps, hand, joints).push
+    assert push is not None, "the arm can reach something on a golden image"
 
     def whole() -> Any:
         return decider.decide(to_maps(*draw(), view=view), hand, joints)

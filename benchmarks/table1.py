@@ -12,6 +12,7 @@ import pregrasp_jax  # noqa: F401  (sets NPROC before jax is imported)
 
 # isort: split
 import argparse
+import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -33,12 +34,14 @@ HEADER = ("set", "policy", "success", "held in any way", "attempts", "motions", 
 def evaluate(policy: str, object_set: str, episodes: int, threads: int) -> dict[str, Any]:
     """Return the evaluation of a policy on a set."""
     assets = AssetsConfig(object_set=object_set) if object_set in BUILTIN else AssetsConfig(object_dir=object_set)  # pyright: ignore[reportArgumentType]
-    strokes = {"robot": "barrett", "primitive": "push_grasp"} if policy in STROKE_SCRIPTS else {}
+    task = TaskOverrides(obstacles_may_leave=True)
+    if policy in STROKE_SCRIPTS:
+        task = dataclasses.replace(task, robot="barrett", primitive="push_grasp")
     request = EvaluationConfig(
         policy=policy,
         assets=assets,
         physics=PhysicsConfig(threads=threads),
-        task=TaskOverrides(obstacles_may_leave=True, **strokes),
+        task=task,
         episodes=episodes,
     )
 
@@ -79,7 +82,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=200, help="test scenes, from the first")
     parser.add_argument("--threads", type=int, default=0, help="of physics; 0 takes every core")
     arguments = parser.parse_args()
-    rows = [HEADER]
+    rows: list[tuple[str, ...]] = [HEADER]
     for object_set in arguments.sets:
         for policy in arguments.policies:
             of_set = object_set if object_set in BUILTIN else f"folder-{Path(object_set).name}"

@@ -63,7 +63,7 @@ class Scenes(types.SimpleNamespace):
         return len(self.object_ids)
 
 
-def make_env(counts):
+def make_env(counts) -> Any:
     ids = np.where(np.arange(MAX_OBJECTS) < np.array(counts)[:, None], 7, -1)
 
     def reset_to(row):

@@ -52,7 +52,7 @@ def push_to(decider: Decider, row: int = 50, col: int = 4) -> Push:
 
 
 def test_rotation_vectors_are_those_of_scipy():
-    turns = Rotation.random(50, random_state=0).as_matrix()
+    turns = Rotation.random(50, rng=np.random.default_rng(0)).as_matrix()
     half = Rotation.from_rotvec(np.pi * np.eye(3)).as_matrix()
     for turn in [*turns, *half, np.eye(3)]:
         vector = rotation_vector(turn)
@@ -207,7 +207,7 @@ def test_states_in_which_nothing_may_move():
 
 def test_motions_that_may_not_be():
     start, end = np.array([-0.3, 0.0, 0.1]), np.array([-0.1, 0.1, 0.1])
-    fine = {"speed": 0.1, "acceleration": 0.5, "limits": Limits()}
+    fine: dict[str, Any] = {"speed": 0.1, "acceleration": 0.5, "limits": Limits()}
     refuse_motion(start, end, **fine)
     for change, said in (
         ({"end": np.array([9.0, 0, 0.1])}, "the box"),
@@ -220,7 +220,8 @@ def test_motions_that_may_not_be():
         ({"acceleration": 9.0}, "acceleration"),
     ):
         with pytest.raises(DeviceError, match=said):
-            refuse_motion(**({"start": start, "end": end} | fine | change))
+            given: dict[str, Any] = {"start": start, "end": end} | fine | change
+            refuse_motion(**given)
     for pose in (np.zeros(5), np.full(6, np.inf)):
         with pytest.raises(DeviceError, match="six finite"):
             refuse_pose(pose)
@@ -370,9 +371,9 @@ class Gripper:
         async def run() -> None:
             data = [SimData(0, values=[0] * 0x420, datatype=DataType.REGISTERS)]
             device = SimDevice(id=65, simdata=data, action=self._act)
-            self.server = ModbusTcpServer(device, address=("127.0.0.1", 0))
-            await self.server.serve_forever(background=True)
-            self.port = self.server.transport.sockets[0].getsockname()[1]
+            server: Any = ModbusTcpServer(device, address=("127.0.0.1", 0))
+            await server.serve_forever(background=True)
+            self.port = server.transport.sockets[0].getsockname()[1]
             self.started.set()
             await asyncio.Event().wait()
 

@@ -79,6 +79,7 @@ def random_joints(count: int) -> np.ndarray:
 
 
 def test_kinematics_of_numpy_are_those_of_jax():
+    assert ROBOT.body
     joints, arm = random_joints(20), ROBOT.body.arm
     flange = np.stack([kinematics.forward_kinematics(BODY.arm, row[:6])[-1] for row in joints])
     forward = jax.jit(jax.vmap(lambda q: kinematics.forward_kinematics(arm, q)[-1]))

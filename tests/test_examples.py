@@ -62,7 +62,8 @@ def test_an_own_place_has_a_wall_and_a_nearer_edge(tmp_path, capsys):
     assert [episode.scene for episode in results["ledge"].episodes] == [0, 1]
     assert re.search(r"^ledge: \d+% of 2 scenes", capsys.readouterr().out, re.MULTILINE)
     points = np.array([[0.0, -0.23, 0.1], [0.0, 0.26, 0.1]])
-    assert [list(WORKSPACES[name].has_left(points)) for name in results] == [[False, True], [True, False]]
+    places: dict[str, Any] = WORKSPACES
+    assert [list(places[name].has_left(points)) for name in results] == [[False, True], [True, False]]
     pixels = np.asarray(Image.open(picture)).astype(int)
     module.draw(module.make_place(Config(scene=SceneConfig(test_scenes=2)), "table"), picture)
     changed = np.abs(pixels - np.asarray(Image.open(picture))).max(axis=-1) > 8

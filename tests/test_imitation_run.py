@@ -2,6 +2,7 @@
 
 import dataclasses
 import types
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -88,7 +89,8 @@ class Silent:
 @pytest.mark.slow
 def test_a_run_that_was_stopped_ends_as_one_that_was_not(collection, tmp_path):
     config = make_config(collection=str(collection))
-    env = types.SimpleNamespace(primitive=types.SimpleNamespace(actions=ACTIONS))
+    env: Any = types.SimpleNamespace(primitive=types.SimpleNamespace(actions=ACTIONS))
+    console: Any = Silent()
 
     def session(path, steps, *, resumed):
         left = iter([False] * steps)
@@ -98,7 +100,7 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(collection, tmp_path):
                 config,
                 env,
                 folder,
-                Silent(),
+                console,
                 resumed=resumed,
                 stop=lambda: next(left, True),  # pyright: ignore
             )

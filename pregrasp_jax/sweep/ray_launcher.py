@@ -42,7 +42,7 @@ class RayLauncher:
             ValueError: ray is not installed, or not even one trial fits.
         """
         require_ray()
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]
 
         self._ray, self._folder = ray, folder
         self._own = not ray.is_initialized()
