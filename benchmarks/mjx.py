@@ -51,7 +51,7 @@ def grid_scene(bank: HullBank, num_objects: int, seed: int) -> SceneParams:
         corners = np.asarray(bank.full.vertices)[hulls[hulls >= 0]].reshape(-1, 3)
         side = 1 if slot % 2 else -1
         reach = corners[:, 1].max() if side < 0 else -corners[:, 1].min()
-        poses[slot, :3] = 0.12 * (slot // 2) - 0.1, side * (reach + 0.0005), 0.0
+        poses[slot, :3] = 0.115 * (slot // 2) - 0.16, side * (reach + 0.0005), 0.0
     return SceneParams(jnp.asarray(ids, jnp.int32), jnp.asarray(poses), jnp.int32(0))
 
 
