@@ -51,17 +51,6 @@ def test_the_ablations_are_those_of_the_paper_and_the_figure_shows_their_trainin
     assert spec.set["train.minutes"] == 30
 
 
-def test_a_size_may_change_a_variant():
-    confined = experiments.read_experiment("confined")
-    tuned = {size: experiments.make_spec(confined, size=size).variants["fine-tuned"] for size in ("budget", "paper")}
-    assert dict(tuned["paper"].settings) == {"task.workspace": "shelf", "exploration.epsilon_start": 0.2}
-    assert dict(tuned["budget"].settings) == {**tuned["paper"].settings, "learner.learning_rate": 0.0003}
-    assert tuned["budget"].init_from == "pretrained"
-    sizes = {"budget": {**confined.sizes["budget"], "variants": {"tuned": {}}}}
-    with pytest.raises(ValueError, match="size budget changes the variant 'tuned'; allowed: as on the open"):
-        experiments.make_spec(dataclasses.replace(confined, sizes=sizes))
-
-
 @pytest.mark.parametrize(
     ("name", "said"),
     [

@@ -25,7 +25,7 @@ class Experiment:
         reference: variant that the others are compared with.
         minutes: of training of each trial, unless told otherwise.
         seeds: of every variant.
-        sizes: name -> preset, settings, and what that size changes of variants.
+        sizes: name -> preset and settings.
         variants: as in a sweep.
         tests: as in a sweep.
         paper: test -> variant -> success (%) and motions.
@@ -85,10 +85,7 @@ def make_spec(
     Raises:
         ValueError: no such size, or this version does not know a setting of the experiment.
     """
-    chosen = dict(lookup(experiment.sizes, size, key="size"))
-    changes = chosen.pop("variants", {})
-    if unknown := changes.keys() - experiment.variants.keys():
-        raise ValueError(f"size {size} changes the variant {min(unknown)!r}; allowed: {', '.join(experiment.variants)}")
+    chosen = lookup(experiment.sizes, size, key="size")
     if minutes is not None or size != "paper":
         chosen = {**chosen, "set": {**chosen["set"], "train.minutes": minutes or experiment.minutes}}
     tests = dict(experiment.tests)
@@ -98,7 +95,7 @@ def make_spec(
     plain = {
         **chosen,
         "seeds": list(seeds if seeds is not None else experiment.seeds),
-        "variants": {name: {**(given or {}), **changes.get(name, {})} for name, given in experiment.variants.items()},
+        "variants": experiment.variants,
         "tests": tests,
         "resources": dict(resources or {}),
     }
