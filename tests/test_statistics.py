@@ -125,6 +125,14 @@ def test_two_places_are_paired_only_when_asked_to() -> None:
     assert compare(A, {**B, "workspace": "table", "workspace_hash": "u"}).settings == ()
 
 
+def test_how_target_ppg_plays_is_named_and_how_it_was_trained_is_not():
+    a, b = (
+        {**B, "config": {"task": {}, "strokes": {"free_space": name, "width": width}}}
+        for name, width in (("feasible", 0.25), ("cluster", 1.0))
+    )
+    assert compare(a, b).settings == ("strokes.free_space: feasible | cluster",)
+
+
 @pytest.mark.parametrize(
     ("other", "message"),
     [
