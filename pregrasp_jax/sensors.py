@@ -12,12 +12,15 @@ from typing import Literal
 from pregrasp_jax import yaml_file
 from pregrasp_jax.settings import check_ranges, from_dict
 
+PointOfCell = Literal["max", "second", "median"]
+"""Which of the points above a cell is its height: the highest, the one below it, or the middle one."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
     """A stereo camera above the table, the masks made from its image, and how far objects differ from their models."""
 
-    cell: Literal["max", "second", "median"] = "max"
+    cell: PointOfCell = "max"
     """Which of the points above a cell is its height: the highest, the one below it, or the middle one."""
     baseline: float = 0.0
     """m between the two imagers; 0 is no stereo camera, and then `subpixel` and `shadow` do nothing."""

@@ -28,6 +28,7 @@ from pregrasp_jax.geometry import rigid_inverse
 from pregrasp_jax.heightmap.views import project_upward
 from pregrasp_jax.robot import clearance, description, get_robot, kinematics, robot_file
 from pregrasp_jax.robot.following import follow
+from pregrasp_jax.sensors import PointOfCell
 from pregrasp_jax.spaces.workspace import TABLE, Box, Workspace
 from pregrasp_jax.task.push import make_push
 from pregrasp_jax.types import OBSTRUCTIONS
@@ -136,7 +137,7 @@ def upward(depth: jax.Array, labels: jax.Array, *, cell: str = "max") -> tuple[j
 
 
 @pytest.mark.parametrize("cell", ["max", "second", "median"])
-def test_projection_is_that_of_the_package(cell: str):
+def test_projection_is_that_of_the_package(cell: PointOfCell):
     rng = np.random.default_rng(3)
     depth = (1.0 - rng.random(CAMERA.shape) * 0.3).astype(np.float32)
     depth[rng.random(depth.shape) < 0.3] = np.nan

@@ -1,6 +1,7 @@
 """A run of PPG that learns from another run's grasps, is stopped, and goes on as if it had not been."""
 
 import dataclasses
+import shutil
 import types
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.checkpoint.chunks import Ring
+from pregrasp_jax.checkpoint.policy import SHIPPED
 from pregrasp_jax.checkpoint.state import save
 from pregrasp_jax.cli.main import main
 from pregrasp_jax.config import StrokesConfig
@@ -156,3 +158,11 @@ def test_how_target_ppg_plays_is_refused_where_it_means_nothing(policy, settings
         main(["evaluate", "--policy", policy, "--episodes", "1", f"--strokes.{settings[0]}", settings[1]])
     error = capsys.readouterr().err
     assert exit_.value.code == 2 and error.startswith("error: ") and error.count("\n") == 1 and message in error
+
+
+def test_a_folder_is_not_target_ppg_for_its_name(tmp_path, monkeypatch, capsys):
+    shutil.copytree(SHIPPED["pretrained"], tmp_path / "target-runs")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        main(["evaluate", "--policy", "target-runs", "--episodes", "1", "--strokes.free-space", "cluster"])
+    assert "strokes.free_space is about Target-PPG, not about policy target-runs" in capsys.readouterr().err

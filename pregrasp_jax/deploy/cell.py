@@ -12,6 +12,7 @@ from pregrasp_jax.deploy.guard import Limits
 from pregrasp_jax.deploy.masks import Target
 from pregrasp_jax.deploy.poses import read_pose, world_from
 from pregrasp_jax.robot.kinematics import Arm
+from pregrasp_jax.sensors import PointOfCell
 from pregrasp_jax.settings import from_dict
 
 Rows = tuple[tuple[float, ...], ...]
@@ -109,7 +110,7 @@ class SimSettings:
 class RuntimeSettings:
     """How maps are made."""
 
-    cell: Literal["max", "second", "median"] | None = None
+    cell: PointOfCell | None = None
     """Which of the points above a cell is its height; null is the one that the policy was trained with."""
     threads: int = 1
 

@@ -8,6 +8,8 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
+from pregrasp_jax.sensors import PointOfCell
+
 FORMAT = "pregrasp_jax bundle 1"
 """What a bundle says that it is."""
 
@@ -125,8 +127,8 @@ class CameraEntry:
     looking: str
     depth: str
     intrinsics: str
-    cell: str
-    """Which of the points above a cell was its height in training: `max`, `second` or `median`."""
+    cell: PointOfCell
+    """Which of the points above a cell was its height in training."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,7 @@ from pregrasp_jax.deploy.log import DecisionLog
 from pregrasp_jax.deploy.masks import Target, fuse
 from pregrasp_jax.deploy.projection import Maps, draw_robot, to_maps
 from pregrasp_jax.deploy.view import View
+from pregrasp_jax.sensors import PointOfCell
 from pregrasp_jax.spaces import motion
 
 LIFT_HEIGHT = 0.2
@@ -76,7 +77,7 @@ class Station:
     arm: ArmDriver
     gripper: GripperDriver
     depth_scale: float | None = None
-    cell: str = "max"
+    cell: PointOfCell = "max"
     log: DecisionLog | None = None
     say: Callable[[str], None] = print
 

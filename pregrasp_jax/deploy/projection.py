@@ -12,6 +12,7 @@ from pregrasp_jax.deploy.contract import GridEntry
 from pregrasp_jax.deploy.drawing import draw_hulls, link_hulls
 from pregrasp_jax.deploy.view import View
 from pregrasp_jax.robot.following import Body
+from pregrasp_jax.sensors import PointOfCell
 from pregrasp_jax.spaces import grid
 
 ROBOT_MARGIN = 0.03
@@ -46,7 +47,7 @@ def project(
     body: Body,
     joint_pos: np.ndarray,
     entry: GridEntry,
-    cell: str = "max",
+    cell: PointOfCell = "max",
 ) -> Maps:
     """Return both maps.
 
@@ -57,7 +58,7 @@ def project(
         body: of the robot.
         joint_pos: [J] rad.
         entry: the grid of the contract.
-        cell: which of the points above a cell is its height: `max`, `second` or `median`; see `heightmap.sensor`.
+        cell: which of the points above a cell is its height; see `heightmap.sensor`.
     """
     depth, label = view.cut(depth_m).copy(), view.cut(labels).copy()
     draw_robot(depth, label, view=view, body=body, joint_pos=joint_pos, entry=entry)
@@ -86,7 +87,7 @@ def draw_robot(
         depth[rows, columns], labels[rows, columns] = drawn.depth[replace], label
 
 
-def to_maps(depth: np.ndarray, labels: np.ndarray, *, view: View, cell: str = "max") -> Maps:
+def to_maps(depth: np.ndarray, labels: np.ndarray, *, view: View, cell: PointOfCell = "max") -> Maps:
     """Project a cut depth image with its labels upward to the grid; `heightmap.views.project_upward`."""
     cells = cells_of(depth, view)
     on_grid = cells < grid.GRID_SIZE**2
@@ -102,10 +103,8 @@ def to_maps(depth: np.ndarray, labels: np.ndarray, *, view: View, cell: str = "m
 
 def cells_of(depth: np.ndarray, view: View) -> np.ndarray:
     """Return the flat index [R, C] int32 of the cell above which each pixel lies; one past the last for none."""
-    place, per_cell = (
-        view.camera.world_from_optical[:3, 3].astype(np.float32),
-        np.float32(1 / grid.HEIGHTMAP_RESOLUTION),
-    )
+    place = view.camera.world_from_optical[:3, 3].astype(np.float32)
+    per_cell = np.float32(1 / grid.HEIGHTMAP_RESOLUTION)
     half = np.float32(grid.WORKSPACE_HALF_SIZE)
     col, row = ((view.rays[axis] * depth + (place[axis] + half)) * per_cell for axis in (0, 1))
     on_grid = (col >= 0) & (col < grid.GRID_SIZE) & (row >= 0) & (row < grid.GRID_SIZE)  # False for NaN

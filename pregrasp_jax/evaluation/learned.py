@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import jax
 
 from pregrasp_jax.checkpoint import TrainedPolicy
-from pregrasp_jax.config import Config
 from pregrasp_jax.evaluation_config import EvaluationConfig
 from pregrasp_jax.learning.imitation import StrokeFunction
 from pregrasp_jax.learning.q_function import make_q_function
@@ -32,8 +31,7 @@ class Learned(NamedTuple):
     fits: bool
 
 
-def _play_q(env: Env, config: Config, trained: TrainedPolicy, style: str, request: EvaluationConfig) -> Learned:
-    del config
+def _play_q(env: Env, trained: TrainedPolicy, style: str, request: EvaluationConfig) -> Learned:
     _refuse_style(style, trained, allowed="")
     # Of the task that it was trained on: a window of another size is another input.
     q_function = make_q_function(trained.config.network, trained.config.task, env.primitive.actions)
@@ -48,11 +46,11 @@ def _play_q(env: Env, config: Config, trained: TrainedPolicy, style: str, reques
     )
 
 
-def _play_strokes(env: Env, config: Config, trained: TrainedPolicy, style: str, request: EvaluationConfig) -> Learned:
+def _play_strokes(env: Env, trained: TrainedPolicy, style: str, request: EvaluationConfig) -> Learned:
     if request.plan:
         raise ValueError(f"plan = True: policy {trained.origin} chooses strokes; allowed is one that chooses pushes")
-    strokes = config.strokes
-    function = StrokeFunction(trained.config.strokes, env.primitive.actions)
+    strokes = trained.config.strokes
+    function = StrokeFunction(strokes, env.primitive.actions)
     styles = {
         "ppg": lambda: make_ppg(env, greedy(function)),
         "target-ppg": lambda: make_target_ppg(env, greedy(function, mask_radius=strokes.mask_radius), strokes),
@@ -65,19 +63,18 @@ def _play_strokes(env: Env, config: Config, trained: TrainedPolicy, style: str, 
     )
 
 
-METHODS: dict[str, Callable[[Env, Config, TrainedPolicy, str, EvaluationConfig], Learned]] = {
+METHODS: dict[str, Callable[[Env, TrainedPolicy, str, EvaluationConfig], Learned]] = {
     "q_learning": _play_q,
     "imitation": _play_strokes,
 }
 """How trained policies are played, by the name of their `train.method`."""
 
 
-def play(env: Env, config: Config, trained: TrainedPolicy, style: str, request: EvaluationConfig) -> Learned:
+def play(env: Env, trained: TrainedPolicy, style: str, request: EvaluationConfig) -> Learned:
     """Return a trained policy in its environment.
 
     Args:
         env: where.
-        config: what it was made from; how Target-PPG plays is in it.
         trained: the policy.
         style: one of `STYLES`, or empty for that of its method.
         request: whether a search decides, and how.
@@ -85,7 +82,7 @@ def play(env: Env, config: Config, trained: TrainedPolicy, style: str, request: 
     Raises:
         ValueError: it cannot be played in that style.
     """
-    return METHODS[trained.config.train.method](env, config, trained, style, request)
+    return METHODS[trained.config.train.method](env, trained, style, request)
 
 
 def _refuse_style(style: str, trained: TrainedPolicy, *, allowed: str) -> None:

@@ -89,7 +89,8 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     if config.network.mirror and not env.symmetric:
         say(f"note: the policy averages mirror images, which are no scenes of workspace '{env.workspace.name}'")
     _, style = _named(request.policy)
-    played = learned.play(env, config, trained, style, request)
+    as_asked = dataclasses.replace(trained.config, strokes=config.strokes)
+    played = learned.play(env, dataclasses.replace(trained, config=as_asked), style, request)
     if not played.fits:
         raise ValueError(f"policy {trained.origin} does not fit its network in this version of the package")
     return Player(played.policy, functools.partial(jax.jit(played.q_values), trained.params), env, config)
@@ -152,7 +153,7 @@ def _check_planning(request: EvaluationConfig, trained: TrainedPolicy | None) ->
 def _check_strokes(request: EvaluationConfig) -> None:
     """Refuse settings of Target-PPG for a policy that has no use for them."""
     given, random = _given(request.strokes), request.policy in STROKE_SCRIPTS
-    if given and "target-" not in request.policy.partition(":")[0]:
+    if given and request.policy != "target-strokes" and _named(request.policy)[1] != "target-ppg":
         raise ValueError(
             f"strokes.{next(iter(given))} is about Target-PPG, not about policy {request.policy}; allowed with it: "
             "target-ppg, target-ppg:FOLDER, target-strokes"
