@@ -5,9 +5,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
+from drawn_params import drawn_params
 
 from pregrasp_jax.checkpoint import TrainedPolicy, load_policy, save_policy
 from pregrasp_jax.config import Config, NetworkConfig, TaskConfig
@@ -21,9 +19,7 @@ ACTIONS = push_actions(get_robot("ur5e_rg2"))
 
 def random_params(q_function: QFunction, seed: int = 0) -> Any:
     """Return parameters that are random in every layer: the best push of fresh ones is noise."""
-    params = q_function.init(jax.random.key(seed))
-    rng = np.random.default_rng(seed)
-    return jax.tree.map(lambda x: x + jnp.asarray(rng.normal(0.0, 0.05, x.shape), jnp.float32), params)
+    return drawn_params(q_function.init, seed=seed)
 
 
 def random_policy(folder: Path, config: Config, seed: int = 0) -> TrainedPolicy:

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 import trimesh
+from drawn_params import drawn_params
 from fake_env import fake_env
 from PIL import Image
 from report_files import write_evaluation
@@ -124,7 +125,7 @@ def test_a_trained_policy_keeps_its_task_and_meets_everybodys_scenes(fake_world:
         network=PRESETS["ci"].network,
     )
     network = QNetwork(width=trained.network.width)
-    params = network.init(jax.random.key(0), np.zeros((1, 100, 100, 2), np.float32))["params"]
+    params = drawn_params(network.init, np.zeros((1, 100, 100, 2), np.float32))["params"]
     save_policy(tmp_path, params, trained, {})
     request = EvaluationConfig(policy=str(tmp_path), episodes=3)
     made = make_player(request)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from drawn_params import drawn_params
 from fake_env import ACTIONS, hand_at
 
 from pregrasp_jax import heightmap
@@ -86,10 +87,7 @@ def make_network():
     network = CompactNetwork(channels=4, blocks=2, initial_bias=0.3)
     images = jax.random.uniform(jax.random.key(1), (3, *SIZE.shape, 3))
     window = Window(images, jnp.array([[-10, -20], [20, 60], [3, 4]]))
-    params = jax.tree.map(
-        lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(2), leaf.shape),
-        network.init(jax.random.key(0), window),
-    )
+    params = drawn_params(network.init, window)
     return network, params, window
 
 
@@ -144,14 +142,11 @@ def test_mirrored_scene_gets_mirrored_values(architecture):
     reflected = Observation(obs.height[::-1], obs.instance_ids[::-1], hand_at((-0.1025, -0.0525)))
     config = NetworkConfig(architecture=architecture, width=1 / 16, mirror=True)
     q = make_q_function(config, TaskConfig(), ACTIONS)
-    params = jax.tree.map(
-        lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(2), leaf.shape), q.init(jax.random.key(0))
-    )
-    alone = dataclasses.replace(q, mirror_fn=None)
-    here, there = (np.asarray(alone.values(params, o, jnp.int32(1))) for o in (obs, reflected))
+    params, values = drawn_params(q.init), jax.jit(dataclasses.replace(q, mirror_fn=None).values)
+    here, there = (np.asarray(values(params, o, jnp.int32(1))) for o in (obs, reflected))
     reach = np.s_[20:100, 30:70]  # 0.2 m to both sides of the hand, and ahead: what the half ring may hold
     assert np.abs(here - there[::-1])[reach].max() > 0.1  # on its own the network is not symmetric
-    found = np.asarray(q.values(params, obs, jnp.int32(1)))
+    found = np.asarray(jax.jit(q.values)(params, obs, jnp.int32(1)))
     np.testing.assert_allclose(found[reach], ((here + there[::-1]) / 2)[reach], rtol=1e-4, atol=1e-4)
 
 
@@ -180,10 +175,11 @@ def test_unguided_exploration_stays_where_the_network_has_values_on_both_sides(h
     """A push without a value would never be learned, and be sampled for ever for its error."""
     config = NetworkConfig(architecture="compact", width=1 / 32, initial_bias=0.2, mirror=True)
     q = make_q_function(config, TaskConfig(full_ring=full_ring), ACTIONS)
-    obs, params = observation(hand), q.init(jax.random.key(0))
+    obs, params = observation(hand), drawn_params(q.init)
     inputs = jax.tree.map(lambda leaf: leaf[None], q.input_fn(obs, jnp.int32(1)))
     assert q.mirror_fn is not None
-    here, there = (np.asarray(q.network.apply({"params": params}, x))[0, ..., 0] for x in (inputs, q.mirror_fn(inputs)))
+    values = jax.jit(q.network.apply)
+    here, there = (np.asarray(values({"params": params}, x))[0, ..., 0] for x in (inputs, q.mirror_fn(inputs)))
     np.testing.assert_array_equal(q.domain_fn(obs.hand), (here != 0) & (there[::-1] != 0))
     mask = grid.half_ring(obs.hand.xy, r_in=0.04, r_out=0.2, full=full_ring)
     assert not (mask & ~q.domain_fn(obs.hand)).any()
@@ -192,13 +188,13 @@ def test_unguided_exploration_stays_where_the_network_has_values_on_both_sides(h
 def test_untrained_it_promises_its_bias_everywhere_and_learns_in_every_layer():
     config = PRESETS["cpu"]
     q = make_q_function(config.network, config.task, ACTIONS)
-    params = q.init(jax.random.key(0))
+    params = jax.jit(q.init)(jax.random.key(0, impl="rbg"))
     assert num_parameters(params) == 117_922  # also the size that config.py and README name
-    values = q.values(params, observation(START), jnp.int32(0))
+    values = jax.jit(q.values)(params, observation(START), jnp.int32(0))
     mask = grid.half_ring(jnp.asarray(START), r_in=config.task.r_in, r_out=config.task.r_out)
     np.testing.assert_allclose(values[mask], 0.5, atol=0.05)
     inputs = jax.tree.map(lambda x: x[None], q.input_fn(observation((-0.1025, 0.0025)), jnp.int32(0)))
-    gradient = jax.grad(lambda p: q.at(p, inputs, jnp.array([2 * (50 * 100 + 50)]))[0])(params)
+    gradient = jax.jit(jax.grad(lambda p: q.at(p, inputs, jnp.array([2 * (50 * 100 + 50)]))[0]))(params)
     flat = {"/".join(str(k.key) for k in path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(gradient)}
     silent = {name for name, leaf in flat.items() if not np.any(leaf)}
     assert all(name.startswith("block") and "_in/" in name for name in silent), silent
@@ -210,11 +206,11 @@ def test_paper_and_compact_answer_alike():
         q = make_q_function(
             NetworkConfig(architecture=architecture, width=1 / 32, initial_bias=0.2), TaskConfig(), ACTIONS
         )
-        params = q.init(jax.random.key(0))
-        values = q.values(params, obs, jnp.int32(0))
+        params = drawn_params(q.init)
+        values = jax.jit(q.values)(params, obs, jnp.int32(0))
         inputs = jax.tree.map(lambda x: x[None], q.input_fn(obs, jnp.int32(0)))
         action = jnp.array([ACTIONS.encode(jnp.int32(52), jnp.int32(40), jnp.int32(1))])
-        np.testing.assert_allclose(q.at(params, inputs, action)[0], values[52, 40, 1], rtol=1e-4)
+        np.testing.assert_allclose(jax.jit(q.at)(params, inputs, action)[0], values[52, 40, 1], rtol=1e-4)
         assert values.shape == (100, 100, 2) and values.dtype == jnp.float32
 
 
@@ -226,14 +222,11 @@ def test_the_mirror_image_of_a_turned_hand_has_the_other_choice():
     reflected = Observation(obs.height[::-1], obs.instance_ids[::-1], hand_at((-0.1025, -0.0525)))
     config = NetworkConfig(architecture="compact", width=1 / 16, mirror=True)
     q = make_q_function(config, TaskConfig(), actions)
-    params = jax.tree.map(
-        lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(2), leaf.shape), q.init(jax.random.key(0))
-    )
-    alone = dataclasses.replace(q, mirror_fn=None)
-    here, there = (np.asarray(alone.values(params, o, jnp.int32(1))) for o in (obs, reflected))
+    params, values = drawn_params(q.init), jax.jit(dataclasses.replace(q, mirror_fn=None).values)
+    here, there = (np.asarray(values(params, o, jnp.int32(1))) for o in (obs, reflected))
     assert here.shape == (100, 100, 3)
     reach = np.s_[30:90, 30:70]
-    found = np.asarray(q.values(params, obs, jnp.int32(1)))
+    found = np.asarray(jax.jit(q.values)(params, obs, jnp.int32(1)))
     np.testing.assert_allclose(found[reach], ((here + there[::-1, :, ::-1]) / 2)[reach], rtol=1e-4, atol=1e-4)
     push = int(actions.encode(jnp.int32(60), jnp.int32(40), jnp.int32(0)))
     inputs = jax.tree.map(lambda leaf: jnp.stack([leaf] * 64), q.input_fn(obs, jnp.int32(1)))

@@ -73,7 +73,7 @@ def test_it_has_the_parameters_of_the_original():
 def test_it_computes_what_its_formula_says():
     network = StrokeNetwork(width=1 / 32)
     image = np.random.default_rng(1).normal(size=(16, 16)).astype(np.float32)
-    params = random_like(network.init(jax.random.key(0), jnp.zeros((1, 16, 16)))["params"])
+    params = random_like(jax.eval_shape(network.init, jax.random.key(0), jnp.zeros((1, 16, 16)))["params"])
     found = np.asarray(network.apply({"params": params}, jnp.asarray(image)[None]))[0]
     p = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params)
     x = np.maximum(convolve(image[..., None].astype(float), p["stem"]["kernel"]), 0)

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from drawn_params import drawn_params
 from fake_env import ACTIONS
 
 from pregrasp_jax.heightmap import network_input
@@ -24,17 +25,13 @@ APPLY, Q_AT = jax.jit(TINY.apply), jax.jit(functools.partial(TINY.apply, method=
 
 @functools.cache
 def initial_params():
-    return jax.jit(TINY.init)(jax.random.key(1), jnp.zeros((1, 20, 20, 2)))
+    return jax.jit(TINY.init)(jax.random.key(1, impl="rbg"), jnp.zeros((1, 20, 20, 2)))
 
 
 @functools.cache
 def tiny_params():
     """Random weights and biases: a readout of full gain and biases that are not 0, as after training."""
-    leaves, treedef = jax.tree.flatten(initial_params())
-    keys = jax.random.split(jax.random.key(2), len(leaves))
-    return treedef.unflatten(
-        [leaf + 0.1 * jax.random.normal(k, leaf.shape) for leaf, k in zip(leaves, keys, strict=True)]
-    )
+    return drawn_params(TINY.init, jnp.zeros((1, 20, 20, 2)))
 
 
 def conv(x, p, padding):
@@ -145,7 +142,7 @@ def test_taken_actions_are_flat_indices():
     action = jnp.array([0, 1, 19_999, 2 * (37 * 100 + 81) + 1])
     whole = APPLY(tiny_params(), x).ravel()
     q = QFunction(TINY, ACTIONS, network_input)
-    taken = q.at(tiny_params()["params"], jnp.broadcast_to(x, (4, *x.shape[1:])), action)
+    taken = jax.jit(q.at)(tiny_params()["params"], jnp.broadcast_to(x, (4, *x.shape[1:])), action)
     np.testing.assert_allclose(taken, whole[action], atol=1e-5 * float(jnp.abs(whole).max()))
 
 
@@ -217,10 +214,10 @@ def test_wrong_shapes_are_named(shape):
 
 def test_a_value_for_each_of_any_number_of_choices():
     network, x = QNetwork(num_choices=5, width=1 / 16), jax.random.normal(jax.random.key(0), (2, 20, 20, 2))
-    params = network.init(jax.random.key(1), x)
-    whole = jnp.asarray(network.apply(params, x))
+    params = drawn_params(network.init, x)
+    whole = jnp.asarray(jax.jit(network.apply)(params, x))
     row, col = jnp.array([3, 19]), jnp.array([0, 7])
-    one = jnp.asarray(network.apply(params, x, row, col, method="q_at"))
+    one = jnp.asarray(jax.jit(functools.partial(network.apply, method="q_at"))(params, x, row, col))
     assert whole.shape == (2, 20, 20, 5) and one.shape == (2, 5)
     assert float(jnp.ptp(one, axis=1).min()) > 1e-5
     np.testing.assert_allclose(one, whole[jnp.arange(2), row, col], atol=1e-5)

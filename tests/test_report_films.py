@@ -6,9 +6,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
+from drawn_params import drawn_params
 from fake_env import fake_env
 from PIL import Image, ImageSequence
 from report_files import evaluation_row, make_films, run_main, write_evaluation, write_run
@@ -49,7 +49,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 def _save_policy(run_dir: Path, seed: int = 0, width: float = PRESETS["ci"].network.width) -> None:
-    params = QNetwork(width=width).init(jax.random.key(seed), np.zeros((1, 100, 100, 2), np.float32))
+    params = drawn_params(QNetwork(width=width).init, np.zeros((1, 100, 100, 2), np.float32), seed=seed)
     save_policy(run_dir / "best", params["params"], PRESETS["ci"], {})
 
 
