@@ -260,6 +260,9 @@ class TrainConfig:
     """Env steps between evaluations on the validation scenes; 0 evaluates only at the end."""
     log_every: int = 200
     """Env steps between rows of metrics.jsonl."""
+    try_grasps: bool = False
+    """Grasp whatever a push has enclosed, and reward only what the grasp holds. The paper rewards the enclosure; between
+    walls one in ten does not hold (docs/confined.md)."""
     tensorboard: bool = False
     """Write the same numbers for TensorBoard, into the run folder (needs the extra `tensorboard`)."""
     fused_iterations: int | None = None

@@ -40,13 +40,14 @@ REASONS = (
     "obstacle_in_region",
     "no_action",
     "truncated",
+    "grasp_failed",
     "target_held",
     "target_not_alone",
     "obstacle_grasped",
 )
 """Why an episode ended; an integer reason indexes this tuple, earlier entries win. The last three are of strokes."""
 
-PUSH_REASONS = REASONS[: REASONS.index("truncated") + 1]
+PUSH_REASONS = REASONS[: REASONS.index("grasp_failed") + 1]
 """Why episodes of pushes end: those that a training counts, and checkpoints hold the counts of."""
 
 OBSTRUCTIONS = ("none", "no_ik", "joint_limit", "table", "wall", "too_long", "end_error", "jammed")
@@ -200,6 +201,7 @@ class Outcome(struct.PyTreeNode):
         obstruction: () int32 index into `OBSTRUCTIONS`, what kept the hand from where it was sent.
         no_action: () bool, no push is allowed after this one.
         diverged: () bool, the physics diverged.
+        slipped: [MAX_OBJECTS] bool, a grasp was tried and did not hold it; none if none was.
     """
 
     coverage: jax.Array
@@ -211,6 +213,7 @@ class Outcome(struct.PyTreeNode):
     obstruction: jax.Array
     no_action: jax.Array
     diverged: jax.Array
+    slipped: jax.Array
 
     @property
     def unreachable(self) -> jax.Array:

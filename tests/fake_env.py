@@ -73,6 +73,7 @@ def make_outcome(**fields: Any) -> Outcome:
         obstruction=jnp.int32(0),
         no_action=jnp.zeros((), bool),
         diverged=jnp.zeros((), bool),
+        slipped=jnp.zeros(MAX_OBJECTS, bool),
     )
     return plain.replace(**fields)
 
@@ -184,6 +185,17 @@ class FakeEnv:
 
     def plan_grasp(self, state: EnvState) -> Plan:
         return make_plan(jnp.zeros((1, 1)), jnp.int32(1), jnp.float32(1.0), jnp.int32(0), state.hand)
+
+    def plan_trial(self, after: EnvState, result: StepResult) -> Plan:
+        return self.plan_grasp(after).unless(~self.rules.encloses(result.reason), "no_ik")
+
+    def conclude_trial(self, after: EnvState, result: StepResult, physics: Any) -> StepResult:
+        del physics
+        slipped = self.rules.encloses(result.reason) & (after.scene_index % 2 == 1)
+        outcome = result.outcome.replace(slipped=jnp.broadcast_to(slipped, (MAX_OBJECTS,)))
+        reward, terminated, reason = self.rules.judge(outcome, after.scene.target)
+        reason = jnp.where(result.truncated, result.reason, reason)
+        return result.replace(outcome=outcome, reward=reward, terminated=terminated, reason=reason)
 
     def conclude_grasp(self, state: EnvState, plan: Plan, physics: Any) -> GraspResult:
         del physics

@@ -17,7 +17,7 @@ def only(slot) -> jax.Array:
 
 
 def outcome(
-    *, coverage=None, closer=0.0, toppled=None, off_table=None, unreachable=False, aperture=1.0, **flags
+    *, coverage=None, closer=0.0, toppled=None, off_table=None, slipped=None, unreachable=False, aperture=1.0, **flags
 ) -> Outcome:
     """A push that changed nothing but what is named; `closer` applies to the goal, decoys move the other way."""
     before = jnp.linspace(0.1, 0.3, MAX_OBJECTS)
@@ -31,6 +31,7 @@ def outcome(
         distance_after=after,
         toppled=only(toppled),
         off_table=only(off_table),
+        slipped=only(slipped),
         aperture=jnp.float32(aperture),
         obstruction=jnp.int32(OBSTRUCTIONS.index("no_ik") if unreachable else 0),
         **{name: jnp.asarray(flags.get(name, False)) for name in names},
@@ -69,6 +70,14 @@ CASES = {
     ),
     "no action left, approach does not count": (outcome(no_action=True, closer=0.1), 0.0, "no_action"),
     "success with no action left": (outcome(no_action=True, coverage={GOAL: 1.0}), 2.0, "target_in_region"),
+    "target slipped out of the grasp": (outcome(coverage={GOAL: 1.0}, closer=0.1, slipped=GOAL), 0.0, "grasp_failed"),
+    "another object slipped": (outcome(coverage={GOAL: 1.0}, slipped=OTHER), 2.0, "target_in_region"),
+    "target slipped beside an obstacle in the region": (
+        outcome(coverage={GOAL: 1.0, OTHER: 1.0}, slipped=GOAL),
+        0.0,
+        "obstacle_in_region",
+    ),
+    "slipped where nothing is in the region": (outcome(closer=0.1, slipped=GOAL), 0.5, "running"),
 }
 
 

@@ -73,6 +73,33 @@ def test_without_a_host_part_it_is_one_program_of_the_callers_making():
 
 
 @pytest.mark.parametrize("on_host", [False, True])
+def test_a_second_motion_begins_where_the_first_has_ended(on_host):
+    env, calls = fake_env(), []
+
+    def advance(physics: Any, ctrl: Any, num_ctrl: Any) -> Any:
+        calls.append(1)
+        return 10 * physics + num_ctrl
+
+    def plan(x: jax.Array) -> Any:
+        return jax.vmap(env.plan)(jax.vmap(env.reset_to)(jnp.arange(3)), jnp.full(3, 9000)).replace(num_ctrl=x)
+
+    def first(x: jax.Array) -> Any:
+        return x, plan(jnp.array([1, 2, 3])), {"x": x}
+
+    def second(kept: Any, done: Any, physics: jax.Array) -> Any:
+        return physics, plan(done.num_ctrl + 1), kept | {"first": physics}
+
+    def last(kept: Any, done: Any, physics: jax.Array) -> Any:
+        return kept | {"second": physics, "rows": done.num_ctrl}
+
+    engine: Any = SimpleNamespace(run=lambda p, c, n: 10 * p + n, advance=advance if on_host else None)
+    result = make_stages(engine, first, second, last).compile(jnp.arange(3))(jnp.array([4, 5, 6]))
+    expected = {"x": [4, 5, 6], "first": [41, 52, 63], "second": [412, 523, 634], "rows": [2, 3, 4]}
+    assert {name: np.asarray(value).tolist() for name, value in result.items()} == expected
+    assert len(calls) == (2 if on_host else 0)
+
+
+@pytest.mark.parametrize("on_host", [False, True])
 def test_controls_end_with_the_physics_and_the_host_is_asked_once_per_call(on_host):
     env, calls, plans = fake_env(), [], []
 

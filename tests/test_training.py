@@ -92,6 +92,37 @@ def test_branches_are_learned_from_and_change_nothing_else():
     assert np.mean(different) > 2.5, "branches of one state are drawn independently"
 
 
+def test_a_grasp_that_is_tried_ends_the_same_episodes_and_pays_only_for_what_holds(monkeypatch):
+    """In the fake world the scenes of odd index drop what is grasped; here with a wide closing region."""
+    monkeypatch.setattr("fake_env.IN_REGION", 0.06)
+    experiences = []
+    for try_grasps in (False, True):
+        config = make_config(try_grasps=try_grasps)
+        values = to_dict(config)
+        values["exploration"] |= {"branches": 2, "epsilon_start": 0.5}
+        values["replay"] |= {"capacity": 300}
+        built = make_program(Config.from_dict(values))
+        state = jax.jit(built.init)(jax.random.key(0))
+        collect_once, actors, seen = jax.jit(built.collect), state.actors, []
+        for _ in range(40):
+            odd = np.tile(np.asarray(actors.env_states.scene_index) % 2 == 1, 3)
+            actors, experience = collect_once(actors, state.learning.learner.params, built.pace)
+            seen.append((odd, jax.device_get(experience.steps)))
+        experiences.append(seen)
+        counts = collect.metrics(actors.tally, built.successes)
+        assert (counts["reasons/grasp_failed"] > 0) == try_grasps
+    success, dropped = PUSH_REASONS.index("target_in_region"), PUSH_REASONS.index("grasp_failed")
+    slips = 0
+    for (odd, untried), (_, tried) in zip(*experiences, strict=True):
+        np.testing.assert_array_equal(tried.action, untried.action)
+        np.testing.assert_array_equal(tried.terminated, untried.terminated)
+        slipped = odd & (untried.reason == success)
+        np.testing.assert_array_equal(tried.reason, np.where(slipped, dropped, untried.reason))
+        np.testing.assert_array_equal(tried.reward, np.where(slipped, 0.0, untried.reward))
+        slips += slipped.sum()
+    assert slips > 3
+
+
 def test_a_finished_run_leaves_everything(finished):
     path = finished.recorder.folder.path
     assert finished.recorder.saved and finished.recorder.counters.episodes >= 24

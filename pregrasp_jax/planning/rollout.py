@@ -14,6 +14,7 @@ from pregrasp_jax.planning.simulation import Simulations
 from pregrasp_jax.policies import scripts
 from pregrasp_jax.task import registry
 from pregrasp_jax.task.env import Env
+from pregrasp_jax.task.grasp import TRIAL_HOLD
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.task.stages import Stages, make_stages
 from pregrasp_jax.types import EnvState, GraspResult, HandPose, HullBank, Observation, SceneParams, StepResult
@@ -24,9 +25,6 @@ NUM_SCRIPTED = 8
 _MOVED, _EDGE = 0.005, 0.02
 """m; an object that moved more than this and ended nearer to an edge than that may have fallen in truth: where objects
 end is known to 1 to 5 cm only after a long way."""
-
-_GRASP_ROWS = 165
-"""Control rows, 3.3 s, of a grasp: until the object is up. The seconds of holding it tell little."""
 
 
 class Pushed(NamedTuple):
@@ -186,8 +184,7 @@ class Rollout:
         return jnp.prod(jnp.where(counts & moved, jnp.clip(0.5 + 0.5 * inside / _EDGE, 0.5, 1.0), 1.0))
 
     def _before_grasp(self, bank: HullBank, states: EnvState, execute: jax.Array) -> tuple[Any, Plan, Any]:
-        plan = jax.vmap(lambda s, go: self._env.plan_grasp(s).unless(~go, "no_ik"))(states, execute)
-        plan = plan.replace(ctrl=plan.ctrl[:, :_GRASP_ROWS], num_ctrl=jnp.minimum(plan.num_ctrl, _GRASP_ROWS))
+        plan = jax.vmap(lambda s, go: self._env.plan_grasp(s, hold=TRIAL_HOLD).unless(~go, "no_ik"))(states, execute)
         return states.physics, plan, (bank, states)
 
     def _after_grasp(self, kept: Any, plan: Plan, physics: Any) -> GraspResult:

@@ -144,9 +144,25 @@ class Env:
         """Return which slots [...] bool of object ids [...] int32 hold an object that may be a target."""
         return (object_ids >= 0) & jnp.asarray(self.eligible)[object_ids]
 
-    def plan_grasp(self, state: EnvState) -> Plan:
-        """Return the motion of the grasp that ends an evaluated episode."""
-        return grasp.plan_grasp(self.robot, self.workspace, state)
+    def plan_grasp(self, state: EnvState, *, hold: float = grasp.HOLD_TIME) -> Plan:
+        """Return the motion of the grasp that ends an evaluated episode, with `hold` s of holding."""
+        return grasp.plan_grasp(self.robot, self.workspace, state, hold=hold)
+
+    def plan_trial(self, after: EnvState, result: StepResult) -> Plan:
+        """Return the motion that tries to grasp what a push has enclosed; it moves nothing if that is nothing."""
+        trial = self.plan_grasp(after, hold=grasp.TRIAL_HOLD)
+        return trial.unless(~self.rules.encloses(result.reason), "no_ik")
+
+    def conclude_trial(self, after: EnvState, result: StepResult, physics: Any) -> StepResult:
+        """Judge a push anew once `physics` has run through `plan_trial`: a target that slips is no success.
+
+        Where obstacles are enclosed they are what may slip, so that hindsight judges by the same rule.
+        """
+        held = grasp.held_objects(self.robot, self.bank, after, self.engine.observe(physics))
+        outcome = result.outcome.replace(slipped=self.rules.encloses(result.reason) & ~held)
+        reward, terminated, reason = self.rules.judge(outcome, after.scene.target)
+        reason = jnp.where(result.truncated, result.reason, reason)
+        return result.replace(outcome=outcome, reward=reward, terminated=terminated, reason=reason)
 
     def grasp(self, state: EnvState, *, execute: jax.Array | bool = True) -> GraspResult:
         """Close with constant force, lift 0.2 m, hold 5 s. Without `execute` () bool nothing is held, at no cost."""

@@ -69,6 +69,10 @@ class Rules:
     successes: tuple[int, ...]
     asks_for_grasp: bool = True
 
+    def encloses(self, reason: jax.Array) -> jax.Array:
+        """Return () bool, whether an episode that ended for this reason has left an object to be grasped."""
+        return self.asks_for_grasp & ((reason == TARGET_IN_REGION) | (reason == OBSTACLE_IN_REGION))
+
     def succeeded(self, reason: jax.Array) -> jax.Array:
         """Return [...] bool, which reasons [...] count as success."""
         return jnp.any(jnp.stack([reason == success for success in self.successes]), axis=0)
@@ -104,6 +108,7 @@ def make_rules(robot: Robot, workspace: Workspace, primitive: Primitive, bank: H
             obstruction=plan.unless(jammed, "jammed").unless(end_error > MAX_END_ERROR, "end_error").obstruction,
             no_action=~jnp.any(primitive.mask(hand)),
             diverged=seen.diverged & ~jammed,
+            slipped=jnp.zeros_like(present),
         )
 
     return judging(lambda aperture: jnp.asarray(region(aperture).exists), task, measure=measure)
@@ -169,13 +174,14 @@ def end_reason(
         "unreachable": outcome.unreachable,
         "off_table": jnp.any(outcome.off_table & is_goal if obstacles_may_leave else outcome.off_table),
         "target_toppled": jnp.any(outcome.toppled & is_goal),
-        "target_in_region": jnp.any(enclosed & is_goal),
+        "target_in_region": jnp.any(enclosed & is_goal & ~outcome.slipped),
         "obstacle_in_region": jnp.any(enclosed & ~is_goal),
         "no_action": outcome.no_action,
+        "grasp_failed": jnp.any(enclosed & is_goal),
     }
-    ends = jnp.stack([holds[reason] for reason in REASONS if reason in holds])
-    first = REASONS.index("nan") + jnp.argmax(ends)
-    return jnp.where(jnp.any(ends), first, RUNNING).astype(jnp.int32)
+    names = [reason for reason in REASONS if reason in holds]
+    ends, codes = jnp.stack([holds[name] for name in names]), jnp.array([REASONS.index(name) for name in names])
+    return jnp.where(jnp.any(ends), codes[jnp.argmax(ends)], RUNNING).astype(jnp.int32)
 
 
 def reward_terms(outcome: Outcome, goal: jax.Array, reason: jax.Array) -> dict[str, jax.Array]:

@@ -1,8 +1,8 @@
-"""A step in three parts: decide and plan | physics | measure, judge, draw.
+"""A step in parts: decide and plan | physics | measure, judge, draw; with a second motion in between, five.
 
-Where the engine runs on the device the three are one program. Where it runs on the host, each of the others is compiled
-for itself: a program with a host callback in it gets no entry in jax's persistent cache, and would be compiled anew at
-every start.
+Where the engine runs on the device they are one program. Where it runs on the host, each of the parts beside it is
+compiled for itself: a program with a host callback in it gets no entry in jax's persistent cache, and would be compiled
+anew at every start.
 """
 
 from collections.abc import Callable
@@ -14,30 +14,32 @@ import jax
 from pregrasp_jax.physics.base import Engine
 from pregrasp_jax.task.primitive import Plan
 
+Part = Callable[..., Any]
+"""All parts but the last return (physics, plan) of all scenes, and anything that the next one needs; all but the first
+take that, the plan without its controls, and the physics after it. The first takes the arguments, the last returns the
+result."""
+
 
 @dataclass(frozen=True)
 class Stages:
-    """A function of a batch of scenes, divided where physics begins and where it ends.
+    """A function of a batch of scenes, divided wherever physics runs.
 
     Attributes:
-        before: (*args) -> (physics, plan) of all scenes, and anything that `after` needs.
+        parts: two or more, with a motion between each of them and the next.
         run: (physics, ctrl, num_ctrl) -> physics, of all scenes, under `jax.jit`.
-        after: (kept, plan without its controls, physics) -> the result.
         advance: `run` on the host, None where `run` stays on the device.
     """
 
-    before: Callable[..., tuple[Any, Plan, Any]]
+    parts: tuple[Part, ...]
     run: Callable[..., Any]
-    after: Callable[..., Any]
     advance: Callable[..., Any] | None = None
 
     def __call__(self, *args: Any) -> Any:
         """Return the result; usable under `jax.jit`."""
-        physics, plan, kept = self.before(*args)
-        return self.after(kept, plan.replace(ctrl=None), self.run(physics, plan.ctrl, plan.num_ctrl))
+        return _chain(self.parts, self.run, args)
 
     def compile(self, *args: Any, compile_fn: Callable[..., Any] | None = None) -> Callable[..., Any]:
-        """Return the function compiled for arguments like these, as one program or as two around the host.
+        """Return the function compiled for arguments like these, as one program or as several around the host.
 
         Args:
             *args: arrays or their shapes.
@@ -45,35 +47,33 @@ class Stages:
         """
         if self.advance is None:
             return (compile_fn or _compile)(self.__call__, args)
-        traced = jax.jit(self.before).trace(*args)
-        physics, plan, kept = traced.out_info
-        before = traced.lower().compile()
-        after = _compile(self.after, (kept, plan.replace(ctrl=None), physics))
-        advance = self.advance
-
-        def divided(*args: Any) -> Any:
-            physics, plan, kept = before(*args)
-            return after(kept, plan.replace(ctrl=None), advance(physics, plan.ctrl, plan.num_ctrl))
-
-        return divided
+        compiled, advance = [], self.advance
+        for part in self.parts:
+            traced = jax.jit(part).trace(*args)
+            compiled.append(traced.lower().compile())
+            if len(compiled) < len(self.parts):
+                physics, plan, kept = traced.out_info
+                args = kept, plan.replace(ctrl=None), physics
+        return lambda *args: _chain(compiled, advance, args)
 
 
-def make_stages(
-    engine: Engine,
-    before: Callable[..., tuple[Any, Plan, Any]],
-    after: Callable[..., Any],
-    *,
-    vmap: Callable[..., Any] = jax.vmap,
-) -> Stages:
+def make_stages(engine: Engine, *parts: Part, vmap: Callable[..., Any] = jax.vmap) -> Stages:
     """Return the stages of a batch around the physics of an engine; see `Stages`.
 
     Args:
         engine: its `run` is mapped over the scenes by `vmap`.
-        before: of a batch.
-        after: of a batch.
+        *parts: of a batch, two or more.
         vmap: maps physics over scenes.
     """
-    return Stages(before=before, run=vmap(engine.run), after=after, advance=engine.advance)
+    return Stages(parts=parts, run=vmap(engine.run), advance=engine.advance)
+
+
+def _chain(parts: Any, run: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+    *leading, last = parts
+    for part in leading:
+        physics, plan, kept = part(*args)
+        args = kept, plan.replace(ctrl=None), run(physics, plan.ctrl, plan.num_ctrl)
+    return last(*args)
 
 
 def _compile(function: Callable[..., Any], args: tuple[Any, ...]) -> Any:

@@ -61,6 +61,14 @@ class Environment(Protocol):
         """Look and judge after it."""
         ...
 
+    def plan_trial(self, after: EnvState, result: StepResult) -> Plan:
+        """Return the motion that tries to grasp what a push has enclosed."""
+        ...
+
+    def conclude_trial(self, after: EnvState, result: StepResult, physics: Any) -> StepResult:
+        """Judge the push anew after it."""
+        ...
+
     def action_mask(self, hand: HandPose) -> jax.Array:
         """Return which actions [H, W, K] bool are allowed next."""
         ...
@@ -169,6 +177,7 @@ def make_collect(
     config: ExplorationConfig,
     *,
     warmup: int,
+    try_grasps: bool = False,
     vmap: VmapFn = jax.vmap,
 ) -> Stages:
     """Return the function ``(actors, params, pace) -> (actors, experience)``: push everywhere, reset what has ended.
@@ -178,6 +187,7 @@ def make_collect(
         q_function: values of pushes.
         config: exploration.
         warmup: env steps before the first update.
+        try_grasps: grasp whatever has been enclosed; a target that slips is no success.
         vmap: maps pushes and resets over scenes.
     """
 
@@ -227,12 +237,26 @@ def make_collect(
         plans = vmap(env.plan)(starts, actions)
         return starts.physics, plans, (actors.replace(key=key), actions, random[:, 0], reset_key)
 
+    def pushed(kept: Any, plans: Plan, physics: Any) -> tuple[EnvState, StepResult]:
+        return vmap(env.conclude)(_with_branches(kept[0].env_states, config), plans, physics)
+
     def conclude(kept: Any, plans: Plan, physics: Any) -> tuple[Actors, Experience]:
+        return learn_from(kept, *pushed(kept, plans, physics))
+
+    def try_grasp(kept: Any, plans: Plan, physics: Any) -> tuple[Any, Plan, Any]:
+        ends, results = pushed(kept, plans, physics)
+        return ends.physics, vmap(env.plan_trial)(ends, results), (kept, ends, results)
+
+    def conclude_trial(tried: Any, plans: Plan, physics: Any) -> tuple[Actors, Experience]:
+        del plans
+        kept, ends, results = tried
+        return learn_from(kept, ends, vmap(env.conclude_trial)(ends, results, physics))
+
+    def learn_from(kept: Any, ends: EnvState, results: StepResult) -> tuple[Actors, Experience]:
         actors, actions, random, reset_key = kept
         states = actors.env_states
         num_envs = states.num_pushes.shape[0]
         starts = _with_branches(states, config)
-        ends, results = vmap(env.conclude)(starts, plans, physics)
         of_branch = jnp.arange(len(actions)) >= num_envs
         results = results.replace(truncated=results.truncated | (of_branch & ~results.terminated))
         root = jnp.arange(len(actions), dtype=jnp.int32) % num_envs
@@ -248,7 +272,8 @@ def make_collect(
         actors = Actors(_select(ended, fresh, next_states), actors.key, tally, mishap)
         return actors, experience.replace(episodes=tally.episodes)
 
-    return make_stages(env.engine, decide, conclude, vmap=vmap)
+    following = (try_grasp, conclude_trial) if try_grasps else (conclude,)
+    return make_stages(env.engine, decide, *following, vmap=vmap)
 
 
 def _with_branches(states: EnvState, config: ExplorationConfig) -> EnvState:

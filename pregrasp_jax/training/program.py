@@ -160,11 +160,16 @@ def make_program(
     """
     q = q_function or make_q_function(config.network, config.task, env.primitive.actions)
     pace = make_pace(config, known_length(config))
-    stages = make_collect(env, q, config.exploration, warmup=config.learner.warmup, vmap=layout.vmap)
-    # Under jit, so that shapes, start and compilation share one trace: that of a physics engine takes seconds.
-    collect = dataclasses.replace(
-        stages, before=jax.jit(stages.before), run=jax.jit(stages.run), after=jax.jit(stages.after)
+    stages = make_collect(
+        env,
+        q,
+        config.exploration,
+        warmup=config.learner.warmup,
+        try_grasps=config.train.try_grasps,
+        vmap=layout.vmap,
     )
+    # Under jit, so that shapes, start and compilation share one trace: that of a physics engine takes seconds.
+    collect = dataclasses.replace(stages, parts=tuple(map(jax.jit, stages.parts)), run=jax.jit(stages.run))
 
     @jax.jit
     def init(key: jax.Array) -> TrainState:

@@ -181,6 +181,8 @@ def make_evaluate(env: Env, config: Config) -> tuple[EvaluateFn, CompileFn]:
 def _imitate(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
     if params is not None:
         raise ValueError("--init-from is not known to train.method = imitation; allowed is to leave it out")
+    if config.train.try_grasps:
+        raise ValueError("train.try_grasps = True is not known to train.method = imitation; allowed is False")
     resumed = folder is not None
     env = own_protocol(_load(config, "train", console))
     folder = folder or _create(run_dir, config)
