@@ -261,8 +261,8 @@ class TrainConfig:
     log_every: int = 200
     """Env steps between rows of metrics.jsonl."""
     try_grasps: bool = False
-    """Grasp whatever a push has enclosed, and reward only what the grasp holds. The paper rewards the enclosure; between
-    walls one in ten does not hold (docs/confined.md)."""
+    """Grasp whatever a push has enclosed, and reward only what the grasp holds. The paper rewards the enclosure; in the
+    shelf one grasp in ten fails (docs/confined.md)."""
     tensorboard: bool = False
     """Write the same numbers for TensorBoard, into the run folder (needs the extra `tensorboard`)."""
     fused_iterations: int | None = None

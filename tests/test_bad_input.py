@@ -48,6 +48,14 @@ COMMAND_LINES = [
         "video_episodes = 0 is out of range; allowed is 1",
     ),
     (
+        "evaluate --policy clear --video-episodes 2",
+        "video_episodes = 2 needs a film; allowed with it is --video FILE",
+    ),
+    (
+        "train ppg --run-dir {w}/new --train.try-grasps True",
+        "train.try_grasps = True is not known to train.method = imitation; allowed is False",
+    ),
+    (
         "pregrasp_jax dokter",
         "Unrecognized options: dokter (Available subcommands: assets, calibrate-check, compare, contract, ",
         "scenes, show, sweep, train, verify)",

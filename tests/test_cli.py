@@ -75,7 +75,7 @@ def test_evaluate_understands_the_documented_line(run: Any, requests: list) -> N
         episodes=30,
         seed=4,
     )
-    assert files == {"json_file": Path("a.json"), "video": Path("v.gif"), "video_episodes": 3}
+    assert files == {"json_file": Path("a.json"), "video": Path("v.gif"), "video_episodes": None}
 
 
 def test_evaluate_has_a_short_spelling_and_defaults(run: Any, requests: list) -> None:

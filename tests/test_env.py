@@ -297,7 +297,9 @@ def test_a_grasp_is_tried_where_something_is_enclosed_and_a_target_that_slips_is
     assert [name for name, moves in zip(CASES, np.asarray(plan.num_ctrl) > 0, strict=True) if moves] == enclosed
     lifted = jax.jit(jax.vmap(env.engine.run))(pushes.batch.physics, plan.ctrl, plan.num_ctrl)
     judge = jax.jit(jax.vmap(env.conclude_trial))
-    tried, dropped = (unstack(judge(pushes.batch, results, physics), CASES) for physics in (lifted, pushes.batch.physics))
+    tried, dropped = (
+        unstack(judge(pushes.batch, results, physics), CASES) for physics in (lifted, pushes.batch.physics)
+    )
     for name, case in CASES.items():
         if name == "target between the fingers after the push":
             continue  # at the tips, where a round can is held by luck

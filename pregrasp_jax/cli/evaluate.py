@@ -19,12 +19,14 @@ ALIASES = {
 }
 """Short names of options."""
 
+_VIDEO_EPISODES = 3
+
 
 def evaluate_options(
     request: Annotated[EvaluationConfig, tyro.conf.arg(name="")],
     json: Path | None = None,
     video: Path | None = None,
-    video_episodes: int = 3,
+    video_episodes: int | None = None,
 ) -> None:
     """Evaluate a policy by the paper's protocol: fixed test scenes, at most ten pushes, one grasp.
 
@@ -38,13 +40,17 @@ def evaluate_options(
         request: What to evaluate.
         json: Write the result here; `pregrasp-jax compare A.json B.json` pairs two of them.
         video: Write a film of some episodes here: .gif, .webp, or .mp4 (extra `video`).
-        video_episodes: Episodes in the film, from the first scene.
+        video_episodes: Episodes in the film, from the first scene; None is three, or all if there are fewer.
     """
     evaluate(request, json_file=json, video=video, video_episodes=video_episodes)
 
 
 def evaluate(
-    request: EvaluationConfig, *, json_file: Path | None = None, video: Path | None = None, video_episodes: int = 3
+    request: EvaluationConfig,
+    *,
+    json_file: Path | None = None,
+    video: Path | None = None,
+    video_episodes: int | None = None,
 ) -> None:
     """Evaluate a policy; see `pregrasp-jax evaluate --help`.
 
@@ -52,7 +58,7 @@ def evaluate(
         request: what to evaluate.
         json_file: where the evaluation document goes.
         video: where a film of the first `video_episodes` episodes goes.
-        video_episodes: at most `request.episodes`.
+        video_episodes: at most `request.episodes`; None is three, or all if there are fewer.
 
     Raises:
         ValueError: something of the request cannot be used, or a file could not be written afterwards.
@@ -65,7 +71,11 @@ def evaluate(
 
     refuse_unwritable(json_file, "json")
     refuse_unwritable(video, "film")
-    if video and not 1 <= video_episodes <= request.episodes:
+    if video_episodes is None:
+        video_episodes = min(_VIDEO_EPISODES, request.episodes)
+    elif video is None:
+        raise ValueError(f"video_episodes = {video_episodes} needs a film; allowed with it is --video FILE")
+    if not 1 <= video_episodes <= request.episodes:
         raise ValueError(f"video_episodes = {video_episodes} is out of range; allowed is 1 to {request.episodes}")
     with EpisodeProgress() as progress:
         player = make_player(request, say=progress.say)

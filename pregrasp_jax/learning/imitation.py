@@ -13,6 +13,7 @@ import optax
 
 from pregrasp_jax.config import StrokesConfig
 from pregrasp_jax.learning import stroke_network as networks
+from pregrasp_jax.learning.networks import same_shapes
 from pregrasp_jax.learning.stroke_network import ApertureNetwork, StrokeNetwork
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace
@@ -89,9 +90,7 @@ class StrokeFunction:
 
     def fits(self, params: Any) -> bool:
         """Return whether parameters belong to these networks."""
-        expected = jax.eval_shape(self.init, jax.random.key(0))
-        shapes = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (params, expected)]
-        return shapes[0] == shapes[1]
+        return same_shapes(params, jax.eval_shape(self.init, jax.random.key(0)))
 
     def values(self, params: Any, height: jax.Array) -> jax.Array:
         """Return the logits [H, W, K] of all starts and headings on a height map [H, W] m."""

@@ -276,3 +276,9 @@ def _inside(rows: jax.Array, height: int, cols: jax.Array, width: int) -> jax.Ar
 def num_parameters(params: Any) -> int:
     """Return the number of scalars in a pytree of parameters."""
     return sum(leaf.size for leaf in jax.tree.leaves(params))
+
+
+def same_shapes(params: Any, expected: Any) -> bool:
+    """Return whether two pytrees of arrays, or of their shapes, have the same structure, shapes and dtypes."""
+    shapes = (jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (params, expected))
+    return next(shapes) == next(shapes)

@@ -18,7 +18,7 @@ from pregrasp_jax.learning.compact import (
     mirror_window,
     window_size,
 )
-from pregrasp_jax.learning.networks import QNetwork
+from pregrasp_jax.learning.networks import QNetwork, same_shapes
 from pregrasp_jax.learning.replay import InputFn
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace
@@ -64,12 +64,7 @@ class QFunction:
 
     def fits(self, params: Params) -> bool:
         """Return whether parameters belong to this network."""
-        expected = jax.eval_shape(self.init, jax.random.key(0))
-
-        def shapes(tree: Any) -> Any:
-            return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
-
-        return shapes(params) == shapes(expected)
+        return same_shapes(params, jax.eval_shape(self.init, jax.random.key(0)))
 
     def apply(self, params: Params, inputs: Any) -> jax.Array:
         """Return the values [B, H, W, K] of all pushes."""

@@ -12,7 +12,6 @@ from typing import Any
 import jax
 
 from pregrasp_jax.physics.base import Engine
-from pregrasp_jax.task.primitive import Plan
 
 Part = Callable[..., Any]
 """All parts but the last return (physics, plan) of all scenes, and anything that the next one needs; all but the first
