@@ -31,7 +31,8 @@ from pregrasp_jax import heightmap
 from pregrasp_jax.policies.exploration import draw_choice
 from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.spaces import grid
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.task.push import SETTLE_TIME
 from pregrasp_jax.types import EnvState

@@ -25,7 +25,8 @@ from pregrasp_jax.physics.mjx_model import make_reference_model
 from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.robot.description import palm_to_grasp_point
 from pregrasp_jax.scene.model import parking_poses
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.types import MAX_OBJECTS, EnvState, SceneParams
 
 NUM_YAWS = 6

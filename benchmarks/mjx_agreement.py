@@ -39,7 +39,8 @@ from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.workspace import TABLE, Workspace, get_workspace
-from pregrasp_jax.task.env import Env, assemble
+from pregrasp_jax.task.assembly import assemble
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.push import push_actions
 from pregrasp_jax.task.rules import TARGET_IN_REGION
 from pregrasp_jax.types import REASONS, HullBank, SceneParams

@@ -24,7 +24,8 @@ from pregrasp_jax.config import AssetsConfig, Config, SceneConfig
 from pregrasp_jax.physics.mjx import LIMITS
 from pregrasp_jax.physics.mjx_model import make_mjx_slot_model
 from pregrasp_jax.policies import scripts
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.rules import RUNNING
 
 sys.path.append(str(Path(__file__).parent.parent / "tests"))

@@ -26,7 +26,8 @@ from pregrasp_jax.config import Config
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.startup import prepare
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.training import collect
 from pregrasp_jax.training.schedules import known_length, make_pace
 from pregrasp_jax.types import EnvState

@@ -29,7 +29,7 @@ from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.spaces.workspace import TABLE
 from pregrasp_jax.task import push_grasp, registry, stroke_rules
-from pregrasp_jax.task.env import make_env
+from pregrasp_jax.task.assembly import make_env
 from pregrasp_jax.training.stroke_collection import begin, make_collect
 from pregrasp_jax.types import MAX_OBJECTS, SceneParams
 

@@ -28,7 +28,7 @@ from pregrasp_jax.config import Config
 from pregrasp_jax.learning import learner, replay
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.presets import PRESETS
-from pregrasp_jax.task.env import make_env
+from pregrasp_jax.task.assembly import make_env
 from pregrasp_jax.training.program import POLICY, Program, TrainState, make_program
 
 STEPS = 40

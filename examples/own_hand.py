@@ -24,7 +24,8 @@ from pregrasp_jax.robot.floating import make_floating_hand
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace, Choice
 from pregrasp_jax.spaces.workspace import Workspace
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.primitive import Primitive
 from pregrasp_jax.task.push import straight_pushes
 from pregrasp_jax.task.registry import KINDS, Kind

@@ -23,7 +23,8 @@ from pregrasp_jax.evaluation import EvaluationResult, evaluate_policy
 from pregrasp_jax.policies.scripts import make_clear
 from pregrasp_jax.report.play import env_hulls
 from pregrasp_jax.spaces.workspace import WORKSPACES, Box, Workspace
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 
 LEDGE = Workspace(
     name="ledge",

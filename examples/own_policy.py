@@ -16,7 +16,8 @@ from pregrasp_jax.config import Config, SceneConfig
 from pregrasp_jax.evaluation import EvaluationResult, evaluate_policy
 from pregrasp_jax.evaluation.statistics import wilson_interval
 from pregrasp_jax.policies.scripts import Policy, nearest_action
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.types import EnvState
 
 NEAR = 0.13

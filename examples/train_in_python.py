@@ -24,7 +24,8 @@ from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.policies.exploration import random_action
 from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.presets import PRESETS
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.training.program import make_program
 from pregrasp_jax.types import REASONS
 

@@ -28,7 +28,8 @@ from gymnasium.vector.utils import batch_space
 from pregrasp_jax.config import Config
 from pregrasp_jax.scene.bank import Split
 from pregrasp_jax.spaces import grid
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.task.stages import make_stages
 from pregrasp_jax.types import MAX_OBJECTS, ROBOT_ID, EnvState, StepResult

@@ -102,8 +102,11 @@ _REALSENSE = Sensor(
 )
 """Subpixel error between well (0.05) and poorly (0.1) textured; a careful hand-eye calibration."""
 
+CLEAN = Sensor()
+"""Gets nothing wrong."""
+
 SENSORS: dict[str, Sensor] = {
-    "clean": Sensor(),
+    "clean": CLEAN,
     "d435": dataclasses.replace(_REALSENSE, baseline=0.050),
     "d455": dataclasses.replace(_REALSENSE, baseline=0.095),
 }

@@ -26,7 +26,8 @@ from pregrasp_jax.deploy.log import DecisionLog
 from pregrasp_jax.deploy.loop import Station
 from pregrasp_jax.deploy.masks import Masks, Target
 from pregrasp_jax.startup import prepare
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.primitive import Stroke
 from pregrasp_jax.types import REASONS, ROBOT_ID, EnvState, HandPose
 

@@ -20,7 +20,8 @@ from pregrasp_jax.config import Config, ExplorationConfig
 from pregrasp_jax.robot.ur5e_rg2 import FINGER_OPEN
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.scene.model import parking_poses
-from pregrasp_jax.task.env import Env, assemble
+from pregrasp_jax.task.assembly import assemble
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.training.dump import load_dump
 from pregrasp_jax.training.mishap import NONE, no_mishap
 from pregrasp_jax.types import MAX_OBJECTS, REASONS

@@ -19,7 +19,8 @@ from pregrasp_jax.robot.ur5e_rg2 import FINGER_CLOSED, FINGER_OPEN
 from pregrasp_jax.scene.model import hull_points, parking_poses
 from pregrasp_jax.scene.spec import compile_spec, scene_spec
 from pregrasp_jax.spaces.workspace import TABLE
-from pregrasp_jax.task.env import Env, make_env, with_task
+from pregrasp_jax.task.assembly import make_env, with_task
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.types import MAX_OBJECTS, OBSTRUCTIONS, REASONS, ROBOT_ID, SceneParams
 
 ROBOT = get_robot("ur5e_rg2")

@@ -16,8 +16,9 @@ from pregrasp_jax.assets.bank import select
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.config import Config, ExplorationConfig, SceneConfig, TaskConfig
 from pregrasp_jax.spaces.workspace import Box, Workspace
-from pregrasp_jax.task import env as env_module
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task import assembly
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.place import refuse_walls
 from pregrasp_jax.task.rules import make_rules
 from pregrasp_jax.types import MAX_OBJECTS, SceneParams
@@ -121,7 +122,7 @@ def test_settings_that_cannot_work_are_refused(monkeypatch):
     with pytest.raises(ValueError, match=r"task\.r_out = 0\.05 leave no cell .*; allowed is a ring"):
         make_env(Config(scene=SceneConfig(test_scenes=3), task=TaskConfig(r_out=0.05)), split="test")
     make_env(Config(scene=SceneConfig(test_scenes=3), task=TaskConfig(r_out=0.06)), split="test")
-    monkeypatch.setattr(env_module.scene_bank, "load_or_build", lambda *_, **__: pytest.fail("packed too early"))
+    monkeypatch.setattr(assembly.scene_bank, "load_or_build", lambda *_, **__: pytest.fail("packed too early"))
     for field, allowed in (("workspace", "table"), ("robot", "ur5e_rg2"), ("primitive", "push")):
         task = dataclasses.replace(TaskConfig(), **{field: "nowhere"})  # pyright: ignore[reportArgumentType]
         with pytest.raises(ValueError, match=rf"task\.{field} = 'nowhere' does not exist; allowed: .*{allowed}"):
@@ -152,7 +153,7 @@ def test_objects_that_no_hand_can_take_are_refused():
     bank = builtin_bank("seen")
     wide = [i for i, why in enumerate(ROBOT.eligibility(bank).reasons) if why]
     with pytest.raises(ValueError, match=rf"none of {len(wide)} objects .* robot ur5e_rg2; .* best coverage"):
-        env_module.eligible_targets(ROBOT, select(bank, wide))
+        assembly.eligible_targets(ROBOT, select(bank, wide))
 
 
 def test_a_robot_without_a_closing_region_has_no_such_rules(env):

@@ -18,7 +18,7 @@ from pregrasp_jax.cli import commands, doctor, replay, report
 from pregrasp_jax.config import Config
 from pregrasp_jax.evaluation import player
 from pregrasp_jax.evaluation_config import EvaluationConfig
-from pregrasp_jax.task.env import make_env
+from pregrasp_jax.task.assembly import make_env
 from pregrasp_jax.training import session
 
 ROOT = Path(__file__).parent.parent

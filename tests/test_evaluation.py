@@ -17,7 +17,7 @@ from pregrasp_jax.config import Config, SceneConfig, TaskConfig
 from pregrasp_jax.evaluation import Episode, EvaluationResult, Evaluator, evaluate_policy, results
 from pregrasp_jax.policies import scripts
 from pregrasp_jax.policies.learned import make_learned
-from pregrasp_jax.task.env import make_env
+from pregrasp_jax.task.assembly import make_env
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.types import REASONS, EnvState, GraspResult, Observation
 

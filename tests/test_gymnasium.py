@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode  # noqa: E402
 import pregrasp_jax.gymnasium as interface  # noqa: E402
 from pregrasp_jax.config import Config, TaskConfig  # noqa: E402
 from pregrasp_jax.presets import PRESETS  # noqa: E402
-from pregrasp_jax.task.env import make_env  # noqa: E402
+from pregrasp_jax.task.assembly import make_env  # noqa: E402
 from pregrasp_jax.types import REASONS  # noqa: E402
 
 SCENES, SEED, PUSHES = 2, 5, 3

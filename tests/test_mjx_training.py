@@ -27,7 +27,8 @@ from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.spaces.workspace import TABLE
-from pregrasp_jax.task.env import Env, assemble
+from pregrasp_jax.task.assembly import assemble
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.training import collect, program
 from pregrasp_jax.training.mishap import NONE
 from pregrasp_jax.types import MAX_OBJECTS, REASONS, SceneParams

@@ -19,7 +19,8 @@ from pregrasp_jax.evaluation import player
 from pregrasp_jax.evaluation.player import EvaluationConfig, Player, make_player
 from pregrasp_jax.report import play as report_play
 from pregrasp_jax.spaces import grid
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 
 TOP, LEFT, MAP, GAP = 26, 8, 300, 8
 """Pixels of a panel: where its first picture begins, the size of a map, the space between pictures."""

@@ -28,7 +28,7 @@ from pregrasp_jax.planning.memory import NOTHING, Sight
 from pregrasp_jax.planning.planner import Planned, Planner, spread_best
 from pregrasp_jax.planning.search import chance, search
 from pregrasp_jax.robot.base import hand_pose_of
-from pregrasp_jax.task.env import make_env
+from pregrasp_jax.task.assembly import make_env
 from pregrasp_jax.types import REASONS, EnvState, Observation, PhysicsObservation, SceneParams
 
 

@@ -17,7 +17,7 @@ from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.heightmap import sensor
 from pregrasp_jax.heightmap.views import project_upward
 from pregrasp_jax.sensors import SENSORS, Sensor, get_sensor
-from pregrasp_jax.task.env import sensor_of
+from pregrasp_jax.task.assembly import sensor_of
 from pregrasp_jax.types import ROBOT_ID
 
 KEY = jax.random.key(0)

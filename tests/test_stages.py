@@ -11,7 +11,8 @@ import pytest
 from fake_env import fake_env
 
 from pregrasp_jax.config import Config, SceneConfig
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.stages import Stages, make_stages
 
 

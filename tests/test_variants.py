@@ -12,7 +12,7 @@ from pregrasp_jax.assets.hulls import volume
 from pregrasp_jax.assets.measure import min_width
 from pregrasp_jax.config import AssetsConfig, Config
 from pregrasp_jax.presets import PRESETS
-from pregrasp_jax.task.env import load_split_bank
+from pregrasp_jax.task.assembly import load_split_bank
 
 SEED = (5, 0)
 

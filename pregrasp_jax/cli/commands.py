@@ -25,7 +25,7 @@ from pregrasp_jax.report.play import draw_decision, draw_scenes
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene.bank import SPLITS, SceneBank
 from pregrasp_jax.startup import prepare
-from pregrasp_jax.task.env import make_env
+from pregrasp_jax.task.assembly import make_env
 from pregrasp_jax.types import HullBank
 
 _SHOWN_SCENES = 12

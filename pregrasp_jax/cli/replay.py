@@ -15,7 +15,8 @@ from pregrasp_jax.cli.outputs import refuse_unwritable
 from pregrasp_jax.report.play import describe_action, env_hulls, in_batch, taken_action
 from pregrasp_jax.scene.bank import SceneBank
 from pregrasp_jax.startup import prepare
-from pregrasp_jax.task.env import Env, assemble, load_split_bank
+from pregrasp_jax.task.assembly import assemble, load_split_bank
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training.dump import Dump, load_dump
 from pregrasp_jax.training.mishap import Mishap

@@ -21,7 +21,8 @@ from pregrasp_jax.policies import scripts
 from pregrasp_jax.policies.ppg import STROKE_SCRIPTS
 from pregrasp_jax.policies.scripts import Policy
 from pregrasp_jax.startup import prepare
-from pregrasp_jax.task.env import Env, make_env, with_task
+from pregrasp_jax.task.assembly import make_env, with_task
+from pregrasp_jax.task.env import Env
 
 NUM_ENVS = 16
 """Scenes side by side, enough to keep the engine's threads busy."""

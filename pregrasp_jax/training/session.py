@@ -17,7 +17,8 @@ from pregrasp_jax.learning.q_function import Params, make_q_function
 from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.settings import to_dict
 from pregrasp_jax.startup import prepare
-from pregrasp_jax.task.env import Env, make_env
+from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.env import Env
 from pregrasp_jax.training import imitation, processes, resources, trainer
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.dump import DumpFn, make_dump
