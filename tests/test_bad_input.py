@@ -325,9 +325,9 @@ NEW_RUN = "train ci --run-dir {w}/new --network.width 1"
             0,
             "0.00 GB are free; allowed is more room: 0.00 GB are needed even without the replay's obs",
         ),
-        (NEW_RUN + " --replay.capacity 1000000", "memory", 2e9, "2.00 GB are free; a smaller replay.capacity helps"),
+        (NEW_RUN + " --replay.capacity 1000000", "memory", 3e9, "3.00 GB are free; a smaller replay.capacity helps"),
         (NEW_RUN + " --replay.capacity 1000000", "disk", 2e9, "2.00 GB are free; a smaller replay.capacity helps"),
-        ("train resume {w}/large", "memory", 2e9, "2.00 GB are free; allowed is more room, or a new run (--init-from"),
+        ("train resume {w}/large", "memory", 3e9, "3.00 GB are free; allowed is more room, or a new run (--init-from"),
         ("train resume {w}/large", "disk", 2e9, "2.00 GB are free; allowed is more room, or a new run (--init-from"),
     ],
 )

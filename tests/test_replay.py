@@ -64,6 +64,7 @@ class World:
             obstruction=jnp.zeros(NUM_ENVS, jnp.int32),
             no_action=jnp.zeros(NUM_ENVS, bool),
             diverged=stack("diverged", bool),
+            slipped=jnp.zeros((NUM_ENVS, MAX_OBJECTS), bool),
         )
         return replay.Steps(
             root=jnp.arange(NUM_ENVS),

@@ -75,7 +75,7 @@ def evaluate(
         video_episodes = min(_VIDEO_EPISODES, request.episodes)
     elif video is None:
         raise ValueError(f"video_episodes = {video_episodes} needs a film; allowed with it is --video FILE")
-    if not 1 <= video_episodes <= request.episodes:
+    elif not 1 <= video_episodes <= request.episodes:
         raise ValueError(f"video_episodes = {video_episodes} is out of range; allowed is 1 to {request.episodes}")
     with EpisodeProgress() as progress:
         player = make_player(request, say=progress.say)
