@@ -138,15 +138,15 @@ def test_failures_and_times_are_counted(run_dir: Path) -> None:
     assert [duration(s) for s in (0, 100, 600, 36000)] == ["0 s", "100 s", "10 min", "10 h"]
 
 
-def test_what_was_in_the_way_stands_beside_its_reason(tmp_path: Path) -> None:
+def test_what_was_in_the_way_stands_under_its_reason(tmp_path: Path) -> None:
     more = {"reasons/unreachable": 4, "unreachable/wall": 3, "unreachable/end_error": 1, "unreachable/no_ik": 0}
     run_dir = write_run(tmp_path / "first", [log_row(100, 10.0, **more), log_row(200, 20.0, **more)])
     stopped = {"failures": {"unreachable": 1}, "obstructions": {"unreachable": {"wall": 1}}, "workspace": "shelf"}
     file = write_evaluation(run_dir / "a.json", "first", [1, 1, 1, 0], **stopped)
     run = read_run(run_dir)
     _, test, training = failure_figures(run, load_evaluations(run, [file]))
-    assert "seen objects, shelf, orthographic camera, 4 scenes" in test and "25 % (1: wall 1)" in test
-    assert "29 % (8: wall 6, end not reached 2)" in training and "(6)" in training
+    assert "seen objects, shelf, orthographic camera, 4 scenes" in test and "push out of reach 25 % (1), · wall 25 % (1)" in test
+    assert "push out of reach 29 % (8), · wall 21 % (6), · end not reached 7 % (2)" in training
 
 
 # --- damaged and young runs ------------------------------------------------------------------------------------------

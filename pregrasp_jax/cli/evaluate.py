@@ -20,6 +20,7 @@ ALIASES = {
 """Short names of options."""
 
 _VIDEO_EPISODES = 3
+"""Episodes in a film unless it is told otherwise."""
 
 
 def evaluate_options(

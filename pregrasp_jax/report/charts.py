@@ -166,16 +166,15 @@ def figure(title: str, series: Sequence[Series], **axes: Any) -> Markup:
 
 
 def _reasons(title: str, failures: Counter[str], total: int, obstructions: Mapping[str, Counter[str]]) -> Markup:
-    """Return bars of reasons, with what was in the way where that is known."""
+    """Return bars of reasons, and under each those of what was in the way where that is known."""
     found = [(reason, count) for reason, count in failures.most_common() if count]
     if not found:
         return boxed(title, element("p", "No episode failed."))
     items = []
     for reason, count in found:
         known = obstructions.get(reason, Counter()).most_common()
-        details = ", ".join(f"{OBSTRUCTION_WORDS.get(name, name)} {number}" for name, number in known if number)
-        text = f"{_percent(count / total)} ({count}{': ' if details else ''}{details})"
-        items.append((_words(reason), 100 * count / total, text))
+        bars = [(_words(reason), count), *((f"· {OBSTRUCTION_WORDS.get(name, name)}", n) for name, n in known if n)]
+        items += [(words, 100 * n / total, f"{_percent(n / total)} ({n})") for words, n in bars]
     limit = max(10.0, 10 * -(-max(value for _, value, _ in items) // 10))
     return boxed(title, bar_chart(items, title=title, x_label="share of the episodes (%)", x_limit=limit))
 

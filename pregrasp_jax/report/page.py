@@ -135,7 +135,8 @@ def _header(run: RunRecord) -> Iterator[Markup]:
     yield element("h1", run.name)
     written = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
     camera, object_set = run.setting("task", "camera", "?"), run.setting("assets", "object_set", "?")
-    text = f"Report of a training run on {object_set} objects, {camera} camera, seed {run.config.get('seed', '?')}."
+    where = f"{object_set} objects, {run.setting('task', 'workspace', 'table')}, {camera} camera"
+    text = f"Report of a training run on {where}, seed {run.config.get('seed', '?')}."
     yield element("p", f"{text} Written {written}.", class_="soft")
     facts = []
     if is_number(run.best.get("success_rate")):
