@@ -25,7 +25,7 @@ from pregrasp_jax.config import LearnerConfig, NetworkConfig, TaskConfig
 from pregrasp_jax.learning import learner
 from pregrasp_jax.learning.networks import num_parameters
 from pregrasp_jax.learning.q_function import make_q_function
-from pregrasp_jax.learning.replay import UNKNOWN, Batch
+from pregrasp_jax.learning.records import UNKNOWN, Batch
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.spaces.grid import GRID_SIZE
 from pregrasp_jax.spaces.workspace import TABLE

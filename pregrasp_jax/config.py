@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from pregrasp_jax.ranges import RANGES
 from pregrasp_jax.settings import check_ranges, from_dict
 
 EngineName = Literal["native", "mjx"]
@@ -298,7 +299,7 @@ class Config:
         Raises:
             ValueError: a value is outside its range; one line names the key, the value and the range.
         """
-        check_ranges(self, _RANGES)
+        check_ranges(self, RANGES)
         if self.task.r_in >= self.task.r_out:
             raise ValueError(f"task.r_in = {self.task.r_in} must be below task.r_out = {self.task.r_out}")
         if self.scene.min_objects > self.scene.max_objects:
@@ -314,72 +315,6 @@ class Config:
                         "1 or more with it"
                     )
         return self
-
-
-_RANGES: dict[str, tuple[float, float]] = {
-    "seed": (0, 2**32 - 1),
-    "assets.variants": (0, 10_000),
-    "scene.min_objects": (2, 8),
-    "scene.max_objects": (2, 8),
-    "scene.train_scenes": (1, 100_000),
-    "scene.validation_scenes": (1, 100_000),
-    "scene.test_scenes": (1, 100_000),
-    "scene.bank_seed": (0, 2**31 - 1),
-    "task.r_in": (0.005, 0.5),
-    "task.r_out": (0.01, 0.5),
-    "task.max_pushes": (1, 100),
-    "task.place.half_width": (0.01, 2.0),
-    "task.place.back": (0.01, 2.0),
-    "task.place.front": (-2.0, 0.0),
-    "task.place.wall_height": (0.01, 2.0),
-    "task.place.wall_thickness": (0.001, 1.0),
-    "task.in_region_reward": (0.0, 100.0),
-    "task.approach_reward": (0.0, 100.0),
-    "task.push_speed": (0.02, 1.0),
-    "physics.threads": (0, 1024),
-    "network.width": (1 / 32, 4.0),
-    "network.initial_bias": (-4.0, 4.0),
-    "replay.capacity": (64, 10_000_000),
-    "replay.priority_exponent": (0.0, 1.0),
-    "replay.importance_exponent": (0.0, 1.0),
-    "replay.importance_steps": (1, 1_000_000_000),
-    "replay.importance_fraction": (0.0, 1.0),
-    "learner.learning_rate": (1e-7, 1.0),
-    "learner.final_learning_rate": (0.0, 1.0),
-    "learner.learning_rate_steps": (0, 1_000_000_000),
-    "learner.learning_rate_fraction": (0.0, 1.0),
-    "learner.discount": (0.0, 0.999),
-    "learner.polyak": (0.0, 1.0),
-    "learner.huber_delta": (1e-4, 100.0),
-    "learner.batch_size": (1, 4096),
-    "learner.updates_per_step": (0.0, 100.0),
-    "learner.warmup": (0, 10_000_000),
-    "exploration.epsilon_start": (0.0, 1.0),
-    "exploration.epsilon_end": (0.0, 1.0),
-    "exploration.epsilon_decay": (1, 1_000_000_000),
-    "exploration.epsilon_fraction": (0.0, 1.0),
-    "exploration.angle_std": (0.0, 10.0),
-    "exploration.open_probability": (0.0, 1.0),
-    "exploration.branches": (0, 64),
-    "exploration.branch_temperature": (1e-3, 100.0),
-    "exploration.branch_spacing": (0.0, 0.5),
-    "strokes.positives": (2, 10_000_000),
-    "strokes.attempts": (1, 1000),
-    "strokes.width": (1 / 32, 4.0),
-    "strokes.epochs": (1, 100_000),
-    "strokes.batch_size": (1, 4096),
-    "strokes.learning_rate": (1e-7, 1.0),
-    "strokes.validation_share": (0.0, 0.9),
-    "strokes.mask_radius": (0.0, 1.0),
-    "train.num_envs": (1, 65_536),
-    "train.episodes": (1, 1_000_000_000),
-    "train.env_steps": (0, 1_000_000_000),
-    "train.minutes": (0.0, 1e6),
-    "train.checkpoint_minutes": (0.0, 1e6),
-    "train.evaluate_every": (0, 1_000_000_000),
-    "train.log_every": (1, 1_000_000_000),
-    "train.fused_iterations": (0, 1_000_000),
-}
 
 
 def with_absolute_paths(config: Config) -> Config:

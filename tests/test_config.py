@@ -7,10 +7,10 @@ import typing
 import pytest
 import yaml
 
-from pregrasp_jax import config as config_module
 from pregrasp_jax.checkpoint import read_config, write_config
 from pregrasp_jax.config import Config
 from pregrasp_jax.presets import PRESETS
+from pregrasp_jax.ranges import RANGES
 from pregrasp_jax.settings import difference, to_dict
 
 
@@ -35,13 +35,13 @@ def numeric_fields(cls: type, prefix: str = "") -> set[str]:
 
 def test_every_number_has_a_range():
     """A new numeric field without a range would be accepted however absurd."""
-    assert numeric_fields(Config) == set(config_module._RANGES)
+    assert numeric_fields(Config) == set(RANGES)
 
 
-@pytest.mark.parametrize("key", sorted(config_module._RANGES))
+@pytest.mark.parametrize("key", sorted(RANGES))
 def test_a_value_beyond_its_range_is_refused(key):
     *stage, name = key.split(".")
-    low, high = config_module._RANGES[key]
+    low, high = RANGES[key]
     for value in (low - 1, high + 1):
         values = to_dict(Config())
         section = functools.reduce(lambda inner, part: inner[part], stage, values)

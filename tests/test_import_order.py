@@ -11,7 +11,7 @@ PACKAGE = Path(pregrasp_jax.__file__).parent
 ORDER = [
     ["messages"],
     ["io"],
-    ["settings", "spaces", "types", "yaml_file"],
+    ["ranges", "settings", "spaces", "types", "yaml_file"],
     ["config", "geometry", "machine", "sensors", "startup"],
     ["evaluation_config", "presets"],
     ["assets"],

@@ -10,7 +10,7 @@ from fake_env import hand_at
 
 from pregrasp_jax.config import LearnerConfig
 from pregrasp_jax.learning import learner
-from pregrasp_jax.learning.replay import UNKNOWN, Batch
+from pregrasp_jax.learning.records import UNKNOWN, Batch
 from pregrasp_jax.types import REASONS, HandPose
 
 H, W = 2, 3

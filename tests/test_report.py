@@ -145,7 +145,10 @@ def test_what_was_in_the_way_stands_under_its_reason(tmp_path: Path) -> None:
     file = write_evaluation(run_dir / "a.json", "first", [1, 1, 1, 0], **stopped)
     run = read_run(run_dir)
     _, test, training = failure_figures(run, load_evaluations(run, [file]))
-    assert "seen objects, shelf, orthographic camera, 4 scenes" in test and "push out of reach 25 % (1), · wall 25 % (1)" in test
+    assert (
+        "seen objects, shelf, orthographic camera, 4 scenes" in test
+        and "push out of reach 25 % (1), · wall 25 % (1)" in test
+    )
     assert "push out of reach 29 % (8), · wall 21 % (6), · end not reached 7 % (2)" in training
 
 

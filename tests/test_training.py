@@ -3,12 +3,10 @@
 import dataclasses
 import io
 import time
-from types import SimpleNamespace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from fake_training import (
     PictureEnv,
@@ -23,15 +21,14 @@ from fake_training import (
 )
 
 from pregrasp_jax.checkpoint import checksum, load_policy
-from pregrasp_jax.config import Config, ExplorationConfig
+from pregrasp_jax.config import ExplorationConfig
 from pregrasp_jax.learning import learner
 from pregrasp_jax.presets import PRESETS
-from pregrasp_jax.settings import to_dict
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training import collect, learn
 from pregrasp_jax.training.run_folder import RunFolder, stored_config
 from pregrasp_jax.training.trainer import Trainer
-from pregrasp_jax.types import OBSTRUCTIONS, PUSH_REASONS, EnvState, StepResult
+from pregrasp_jax.types import PUSH_REASONS, EnvState, StepResult
 
 
 @pytest.fixture(scope="module")
@@ -52,75 +49,6 @@ def test_metrics_add_up(finished):
     assert log[0]["train/loss"] is None and last["train/loss"] > 0
     assert log[0]["train/explored"] == 1.0, "the warm-up explores only"
     assert last["train/epsilon"] == pytest.approx(1.0 - 0.9 * min(1.0, last["env_steps"] / 64))
-
-
-def test_branches_are_learned_from_and_change_nothing_else():
-    """Three pushes from every state: the scenes go on from the first, the others are episodes cut short."""
-    values = to_dict(make_config())
-    values["exploration"] |= {"branches": 2, "epsilon_start": 0.5}
-    values["replay"] |= {"capacity": 300}
-    built = make_program(Config.from_dict(values))
-    state = jax.jit(built.init)(jax.random.key(0))
-    collect_once, remember = jax.jit(built.collect), jax.jit(built.remember)
-    params, branch_actions = state.learning.learner.params, []
-    for step in range(1, 9):
-        before = state.actors
-        actors, experience = collect_once(before, params, built.pace)
-        learning = remember(state.learning, experience)
-        state = state.replace(actors=actors, learning=learning)
-        steps = experience.steps
-        assert steps.action.shape == (9,) and int(actors.tally.env_steps) == 3 * step
-        for branch in range(3):
-            of_branch = slice(3 * branch, 3 * branch + 3)
-            np.testing.assert_array_equal(steps.obs.height[of_branch], before.env_states.obs.height)
-            np.testing.assert_array_equal(steps.goal[of_branch], before.env_states.scene.target)
-        ended = np.asarray(steps.terminated | steps.truncated)
-        assert ended[3:].all() and not np.any(steps.terminated & steps.truncated)
-        going_on = ~ended[:3]
-        np.testing.assert_array_equal(
-            np.asarray(actors.env_states.obs.height)[going_on], np.asarray(steps.next_obs.height)[:3][going_on]
-        )
-        branch_actions.append(np.asarray(steps.action).reshape(3, 3))
-        memory = learning.replay
-        assert int(memory.rows_written) == 9 * step + int(memory.hindsight_rows_written)
-        # The state before a push is stored once, for its three pushes and the one before.
-        assert int(memory.observations_written) == 9 * step + 3 + int(actors.tally.episodes) - int(ended[:3].sum())
-        slots = np.asarray(memory.episodes.rows)[:, 0]
-        stored = np.asarray(memory.observations.height)[np.asarray(memory.rows.obs_slot)[slots[3:]]]
-        np.testing.assert_array_equal(stored, steps.obs.height[3:])
-    different = [len(set(actions)) for actions in np.concatenate(branch_actions, axis=1).T]
-    assert np.mean(different) > 2.5, "branches of one state are drawn independently"
-
-
-def test_a_grasp_that_is_tried_ends_the_same_episodes_and_pays_only_for_what_holds(monkeypatch):
-    """In the fake world the scenes of odd index drop what is grasped; here with a wide closing region."""
-    monkeypatch.setattr("fake_env.IN_REGION", 0.06)
-    experiences = []
-    for try_grasps in (False, True):
-        config = make_config(try_grasps=try_grasps)
-        values = to_dict(config)
-        values["exploration"] |= {"branches": 2, "epsilon_start": 0.5}
-        values["replay"] |= {"capacity": 300}
-        built = make_program(Config.from_dict(values))
-        state = jax.jit(built.init)(jax.random.key(0))
-        collect_once, actors, seen = jax.jit(built.collect), state.actors, []
-        for _ in range(40):
-            odd = np.tile(np.asarray(actors.env_states.scene_index) % 2 == 1, 3)
-            actors, experience = collect_once(actors, state.learning.learner.params, built.pace)
-            seen.append((odd, jax.device_get(experience.steps)))
-        experiences.append(seen)
-        counts = collect.metrics(actors.tally, built.successes)
-        assert (counts["reasons/grasp_failed"] > 0) == try_grasps
-    success, dropped = PUSH_REASONS.index("target_in_region"), PUSH_REASONS.index("grasp_failed")
-    slips = 0
-    for (odd, untried), (_, tried) in zip(*experiences, strict=True):
-        np.testing.assert_array_equal(tried.action, untried.action)
-        np.testing.assert_array_equal(tried.terminated, untried.terminated)
-        slipped = odd & (untried.reason == success)
-        np.testing.assert_array_equal(tried.reason, np.where(slipped, dropped, untried.reason))
-        np.testing.assert_array_equal(tried.reward, np.where(slipped, 0.0, untried.reward))
-        slips += slipped.sum()
-    assert slips > 3
 
 
 def test_a_finished_run_leaves_everything(finished):
@@ -290,49 +218,6 @@ def test_the_step_size_decays_linearly_and_stays():
         )
 
 
-def test_tally_keeps_the_reasons_of_the_last_episodes():
-    window = 4
-    tally = collect.Tally(
-        env_steps=jnp.int32(0),
-        episodes=jnp.int32(0),
-        recent=jnp.full(window, -1, jnp.int8),
-        pushes=jnp.int32(0),
-        reward=jnp.float32(0),
-        explored=jnp.int32(0),
-        overflowed=jnp.int32(0),
-        diverged=jnp.int32(0),
-        reasons=jnp.zeros(len(PUSH_REASONS), jnp.int32),
-        obstructions=jnp.zeros(len(OBSTRUCTIONS), jnp.int32),
-    )
-    success, truncated = PUSH_REASONS.index("target_in_region"), PUSH_REASONS.index("truncated")
-    stopped, wall, error = (
-        PUSH_REASONS.index("unreachable"),
-        OBSTRUCTIONS.index("wall"),
-        OBSTRUCTIONS.index("end_error"),
-    )
-    pushes = [([success, 0, truncated], [1, 0, 1]), ([0, success, success], [0, 1, 1]), ([stopped, 0, 0], [1, 0, 0])]
-    for reason, ended in pushes:
-        # A physics failure goes before what stopped the hand: only the reason tells.
-        outcome = SimpleNamespace(obstruction=jnp.array([wall if reason[0] == stopped else 0, 0, error]))
-        results: Any = SimpleNamespace(reason=jnp.array(reason), reward=jnp.ones(3), outcome=outcome)
-        random, overflowed = jnp.array([True, False, False]), jnp.array([reason[0] == success, False, True])
-        diverged = jnp.array([False, False, False, reason[1] == success, True])  # with a branch of two scenes
-        tally = collect._count(tally, results, jnp.array(ended, bool), random, overflowed, diverged)
-    report = collect.metrics(tally, (success,))
-    assert report["train/success_rate"] == 0.5, "the first success has left the window of four"
-    assert (report["episodes"], report["env_steps"]) == (5, 9)
-    assert (report["reasons/target_in_region"], report["reasons/truncated"]) == (3, 1)
-    assert {name: report[f"unreachable/{name}"] for name in OBSTRUCTIONS[1:] if report[f"unreachable/{name}"]} == {
-        "wall": 1
-    }
-    assert report["train/explored"] == pytest.approx(1 / 3) and report["train/episode_length"] == pytest.approx(9 / 5)
-    assert report["physics/overflows"] == 4, "one in the first scene, three in the last"
-    assert report["physics/diverged"] == 4, "one in one branch, three in the last"
-    fresh = collect.metrics(tally.begin_report(), (success,))
-    assert fresh["physics/overflows"] == 0 and fresh["physics/diverged"] == 0
-    assert fresh["train/success_rate"] == 0.5 and fresh["train/reward"] is None and fresh["episodes"] == 5
-
-
 @dataclasses.dataclass(frozen=True)
 class CountingEnv(PictureEnv):
     """Notes every trace of a push; a physics engine takes seconds to trace. All are short of contacts."""
@@ -369,27 +254,6 @@ def test_a_run_of_fused_iterations_measures_what_the_loop_does(tmp_path, finishe
         assert expected.keys() == got.keys()
         for name, value in expected.items():
             assert got[name] == (value if value is None else pytest.approx(value, rel=1e-3, abs=1e-6)), name
-
-
-def test_a_scene_that_ended_starts_anew_and_the_others_go_on():
-    config = make_config()
-    env = PictureEnv()
-    built = make_program(config)
-    actors = built.init(jax.random.key(3)).actors
-    params = built.shapes().learning.learner.params
-    collect_fn, params = jax.jit(built.collect), jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), params)
-    for _ in range(12):
-        before = actors
-        actors, experience = collect_fn(actors, params, built.pace)
-        steps = experience.steps
-        ended = np.asarray(steps.terminated | steps.truncated)
-        pushed, _ = jax.vmap(env.step)(before.env_states, steps.action)
-        np.testing.assert_array_equal(steps.obs.height, before.env_states.obs.height)
-        np.testing.assert_array_equal(steps.next_obs.height, pushed.obs.height)
-        now = np.asarray(actors.env_states.num_pushes)
-        np.testing.assert_array_equal(now, np.where(ended, 0, np.asarray(pushed.num_pushes)))
-        eligible = np.isin(np.asarray(before.env_states.scene.object_ids), [0, 1])
-        np.testing.assert_array_equal(experience.eligible, eligible)
 
 
 def test_the_learner_measures_what_the_report_prints(monkeypatch):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from pregrasp_jax.learning import replay as replay_lib
-from pregrasp_jax.learning.replay import Replay
+from pregrasp_jax.learning.records import UNKNOWN, Replay
 from pregrasp_jax.task.rules import Rules, Verdict
 from pregrasp_jax.types import Outcome
 
@@ -53,7 +53,7 @@ def add_hindsight(replay: Replay, eligible: jax.Array, rules: Rules) -> Replay:
         terminated=verdicts.terminated,
         reason=verdicts.reason,
         hindsight=jnp.ones_like(valid),
-        next_value=jnp.where(verdicts.terminated, 0.0, replay_lib.UNKNOWN),
+        next_value=jnp.where(verdicts.terminated, 0.0, UNKNOWN),
     )
     valid = valid & (found & episodes.ended)[:, None]
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), relabelled)

@@ -16,7 +16,7 @@ import optax
 from pregrasp_jax.config import LearnerConfig, ReplayConfig
 from pregrasp_jax.learning import replay as replay_lib
 from pregrasp_jax.learning.q_function import Params, QFunction
-from pregrasp_jax.learning.replay import UNKNOWN, Batch, Replay
+from pregrasp_jax.learning.records import UNKNOWN, Batch, Replay
 from pregrasp_jax.types import HandPose
 
 MaskFn = Callable[[HandPose], jax.Array]

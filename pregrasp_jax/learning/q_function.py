@@ -19,7 +19,7 @@ from pregrasp_jax.learning.compact import (
     window_size,
 )
 from pregrasp_jax.learning.networks import QNetwork, same_shapes
-from pregrasp_jax.learning.replay import InputFn
+from pregrasp_jax.learning.records import InputFn
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace
 from pregrasp_jax.types import HandPose, Observation

@@ -16,7 +16,7 @@ import numpy as np
 from pregrasp_jax.config import ExplorationConfig
 from pregrasp_jax.learning.learner import Params, greedy_action
 from pregrasp_jax.learning.q_function import QFunction
-from pregrasp_jax.learning.replay import Steps
+from pregrasp_jax.learning.records import Steps
 from pregrasp_jax.physics.base import Engine
 from pregrasp_jax.policies import exploration
 from pregrasp_jax.task.primitive import Plan, Primitive
@@ -241,7 +241,7 @@ def make_collect(
         return vmap(env.conclude)(_with_branches(kept[0].env_states, config), plans, physics)
 
     def conclude(kept: Any, plans: Plan, physics: Any) -> tuple[Actors, Experience]:
-        return learn_from(kept, *pushed(kept, plans, physics))
+        return hand_over(kept, *pushed(kept, plans, physics))
 
     def try_grasp(kept: Any, plans: Plan, physics: Any) -> tuple[Any, Plan, Any]:
         ends, results = pushed(kept, plans, physics)
@@ -250,9 +250,10 @@ def make_collect(
     def conclude_trial(tried: Any, plans: Plan, physics: Any) -> tuple[Actors, Experience]:
         del plans
         kept, ends, results = tried
-        return learn_from(kept, ends, vmap(env.conclude_trial)(ends, results, physics))
+        return hand_over(kept, ends, vmap(env.conclude_trial)(ends, results, physics))
 
-    def learn_from(kept: Any, ends: EnvState, results: StepResult) -> tuple[Actors, Experience]:
+    def hand_over(kept: Any, ends: EnvState, results: StepResult) -> tuple[Actors, Experience]:
+        """Return the actors, anew where an episode has ended, and what the learner gets."""
         actors, actions, random, reset_key = kept
         states = actors.env_states
         num_envs = states.num_pushes.shape[0]

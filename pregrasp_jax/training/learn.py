@@ -18,7 +18,7 @@ from pregrasp_jax.learning import hindsight, learner
 from pregrasp_jax.learning import replay as replay_lib
 from pregrasp_jax.learning.learner import LearnerState
 from pregrasp_jax.learning.q_function import Params
-from pregrasp_jax.learning.replay import Replay, Steps
+from pregrasp_jax.learning.records import Replay, Steps
 from pregrasp_jax.policies.exploration import linear_schedule
 from pregrasp_jax.task.rules import Rules
 from pregrasp_jax.training.collect import Experience
