@@ -146,11 +146,12 @@ def on_block():
         **{name: jnp.asarray(value, jnp.float32) for name, value in fields.items()},
     )
     rng = np.random.default_rng(0)
+    collide = jax.jit(capsule_hull)
 
     def contacts(position, axis):
         axes = axes_along(np.asarray(axis, np.float64), rng)
         info = GeomInfo(*(jnp.asarray(x, jnp.float32) for x in (position, axes, [0.01, 0.04, 0.0])))
-        return [np.asarray(x) for x in capsule_hull(info, block)]
+        return [np.asarray(x) for x in collide(info, block)]
 
     return contacts
 

@@ -132,10 +132,10 @@ def test_a_trained_policy_keeps_its_task_and_meets_everybodys_scenes(fake_world:
     document = run_evaluation(request, made)
     assert fake_world[0].task == trained.task and fake_world[0].scene == SceneConfig()
     assert document["camera"] == "pinhole" and document["episodes"] == 3
-    state = made.env.reset_to(jax.numpy.int32(0))
+    state = jax.jit(made.env.reset_to)(np.int32(0))
     assert made.q_values is not None
-    q = np.where(np.asarray(made.env.action_mask(state.hand)), made.q_values(state), -np.inf)
-    assert callable(made.policy) and int(made.policy(state, jax.random.key(0))) == q.argmax()
+    q = np.where(jax.jit(made.env.action_mask)(state.hand), jax.jit(made.q_values)(state), -np.inf)
+    assert callable(made.policy) and int(jax.jit(made.policy)(state, jax.random.key(0))) == q.argmax()
 
 
 def test_requests_override_the_camera_and_more_episodes_need_more_scenes(fake_world: list[Config]) -> None:
@@ -147,9 +147,9 @@ def test_requests_override_the_camera_and_more_episodes_need_more_scenes(fake_wo
 def test_a_smaller_ring_changes_where_the_shipped_policy_may_push_not_what_it_sees(fake_world: list[Config]) -> None:
     tasks = (TaskOverrides(r_out=r_out) for r_out in (None, 0.12))
     usual, narrow = (make_player(EvaluationConfig(policy="pretrained", task=task)) for task in tasks)
-    state = usual.env.reset_to(jax.numpy.int32(0))
+    state = jax.jit(usual.env.reset_to)(np.int32(0))
     assert usual.q_values is not None and narrow.q_values is not None
-    np.testing.assert_array_equal(usual.q_values(state), narrow.q_values(state))
+    np.testing.assert_array_equal(*(jax.jit(q_values)(state) for q_values in (usual.q_values, narrow.q_values)))
     assert narrow.env.action_mask(state.hand).sum() < usual.env.action_mask(state.hand).sum()
     with pytest.raises(ValueError, match=r"r_out = 0.25 is out of range; allowed for this policy, .* is 0.04 to 0.2"):
         make_player(EvaluationConfig(policy="pretrained", task=TaskOverrides(r_out=0.25)))

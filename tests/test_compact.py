@@ -41,6 +41,12 @@ def observation(p1) -> Observation:
     return Observation(jnp.asarray((7 * rows + 13 * cols) % 256, jnp.uint8), jnp.asarray(ids, jnp.uint8), hand_at(p1))
 
 
+def reflection(obs: Observation, p1) -> Observation:
+    """Return the observation reflected by hand: rows are y, so they and the hand's y turn around."""
+    height, ids = (jnp.asarray(np.asarray(leaf)[::-1]) for leaf in (obs.height, obs.instance_ids))
+    return Observation(height, ids, hand_at(p1))
+
+
 @pytest.mark.parametrize("p1", [START, (-0.1025, 0.0525), (0.2475, 0.2475), (-0.2475, -0.2475), (0.0025, -0.1)])
 def test_window_is_the_picture_around_the_hand_and_zero_outside(p1):
     obs = observation(p1)
@@ -64,23 +70,23 @@ def test_window_holds_every_cell_of_the_ring(r_out, full_ring):
     task = TaskConfig(r_out=r_out, full_ring=full_ring)
     size = window_size(task)
     assert size.shape[0] % PATCH == 1 and size.shape[1] % PATCH == 0
+    around, put_back = jax.jit(functools.partial(look_around_hand, size=size)), jax.jit(paste)
     for p1 in (START, (0.0025, 0.0025), (0.1975, -0.2475)):
-        mask = grid.half_ring(jnp.array(p1), r_in=task.r_in, r_out=r_out, full=full_ring)
-        origin = look_around_hand(observation(p1), jnp.int32(0), size=size).origin
-        inside = paste(jnp.ones((*size.shape, 2)), origin)[..., 0]
-        assert bool(jnp.all(inside[mask] == 1.0)) and bool(mask.any())
+        mask = grid.half_ring(np.array(p1, np.float32), r_in=task.r_in, r_out=r_out, full=full_ring)
+        inside = np.asarray(put_back(np.ones((*size.shape, 2)), around(observation(p1), jnp.int32(0)).origin))
+        assert mask.any() and (inside[mask] == 1.0).all()
 
 
 def test_paste_puts_cells_where_they_come_from():
-    q = jnp.arange(8.0 * 12 * 2).reshape(8, 12, 2)
-    pasted = np.asarray(paste(q, jnp.array([-3, 95])))
+    q = np.arange(8.0 * 12 * 2, dtype=np.float32).reshape(8, 12, 2)
+    pasted = np.asarray(jax.jit(paste)(q, np.array([-3, 95])))
     np.testing.assert_array_equal(pasted[:5, 95:], q[3:, :5])
     assert (pasted[5:] == 0).all() and (pasted[:, :95] == 0).all()
 
 
 def test_patches_hold_their_own_pixels():
-    x = jnp.arange(2 * 8 * 12 * 3.0).reshape(2, 8, 12, 3)
-    np.testing.assert_array_equal(patches(x)[1, 1, 2].reshape(4, 4, 3), x[1, 4:8, 8:12])
+    x = np.arange(2 * 8 * 12 * 3.0, dtype=np.float32).reshape(2, 8, 12, 3)
+    np.testing.assert_array_equal(np.asarray(patches(jnp.asarray(x)))[1, 1, 2].reshape(4, 4, 3), x[1, 4:8, 8:12])
 
 
 def make_network():
@@ -96,10 +102,10 @@ def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window
     whole = np.asarray(jax.jit(network.apply)(params, window))
     assert whole.shape == (3, 100, 100, 2) and np.ptp(whole) > 0.1
     actions = [
-        ACTIONS.encode(jnp.int32(r), jnp.int32(c), jnp.int32(a)) for r, c, a in ((9, 30, 1), (99, 99, 0), (80, 3, 1))
+        ACTIONS.encode(np.int32(r), np.int32(c), np.int32(a)) for r, c, a in ((9, 30, 1), (99, 99, 0), (80, 3, 1))
     ]
     q = QFunction(network, ACTIONS, functools.partial(look_around_hand, size=SIZE))
-    taken = jax.jit(q.at)(params["params"], window, jnp.stack(actions))
+    taken = np.asarray(jax.jit(q.at)(params["params"], window, np.stack(actions)))
     np.testing.assert_allclose(taken[:2], [whole[0, 9, 30, 1], whole[1, 99, 99, 0]], rtol=1e-5)
     assert taken[2] == whole[2, 80, 3, 1] == 0.0  # left of its window
     assert whole[2, 80, 4, 1] != 0.0
@@ -107,7 +113,7 @@ def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window
 
 def test_coordinates_say_where_patches_lie_in_the_window_and_on_the_table():
     window = Window(jnp.zeros((2, 8, 12, 3)), jnp.array([[0, 0], [-4, 90]]))
-    found = np.asarray(coordinates(window))
+    found = np.asarray(jax.jit(coordinates)(window))
     assert found.shape == (2, 2, 3, 8)
     for scene, (first_row, first_col) in enumerate(window.origin.tolist()):
         for row, col in np.ndindex(2, 3):
@@ -121,7 +127,8 @@ def test_values_move_with_the_hand_and_the_scene():
     """The same surroundings two patches further give the same values two patches further, but for the table's edge."""
     network, params, _ = make_network()
     stem = params["params"]["stem"]
-    stem["kernel"] = stem["kernel"].at[:, :, -8:].set(0.0)  # does not look where on the table it is
+    stem["kernel"] = np.array(stem["kernel"])
+    stem["kernel"][:, :, -8:] = 0.0  # does not look where on the table it is
     q = jax.jit(
         lambda obs: network.apply(
             params, jax.tree.map(lambda x: x[None], look_around_hand(obs, jnp.int32(0), size=SIZE))
@@ -137,9 +144,8 @@ def test_values_move_with_the_hand_and_the_scene():
 
 @pytest.mark.parametrize("architecture", ["paper", "compact"])
 def test_mirrored_scene_gets_mirrored_values(architecture):
-    """The reflection is made of the observation by hand: rows are y, so they and the hand's y turn around."""
     obs = observation((-0.1025, 0.0525))
-    reflected = Observation(obs.height[::-1], obs.instance_ids[::-1], hand_at((-0.1025, -0.0525)))
+    reflected = reflection(obs, (-0.1025, -0.0525))
     config = NetworkConfig(architecture=architecture, width=1 / 16, mirror=True)
     q = make_q_function(config, TaskConfig(), ACTIONS)
     params, values = drawn_params(q.init), jax.jit(dataclasses.replace(q, mirror_fn=None).values)
@@ -153,16 +159,19 @@ def test_mirrored_scene_gets_mirrored_values(architecture):
 def test_augmented_pushes_are_those_of_the_scene_or_of_its_mirror_image():
     q = make_q_function(NetworkConfig(architecture="compact", width=1 / 16, mirror=True), TaskConfig(), ACTIONS)
     obs = observation((-0.1025, 0.0525))
-    reflected = Observation(obs.height[::-1], obs.instance_ids[::-1], hand_at((-0.1025, -0.0525)))
+    reflected = reflection(obs, (-0.1025, -0.0525))
     pushes = {False: (obs, 60 * 100 + 40), True: (reflected, 39 * 100 + 40)}  # y = 0.0525 and -0.0525
-    inputs = jax.tree.map(lambda leaf: jnp.stack([leaf] * 64), q.input_fn(obs, jnp.int32(1)))
-    windows, actions = q.augment(jax.random.key(0), inputs, jnp.full(64, 2 * pushes[False][1] + 1))
+    look = jax.jit(q.input_fn)
+    inputs = jax.tree.map(lambda leaf: np.stack([leaf] * 64), look(obs, jnp.int32(1)))
+    windows, actions = jax.device_get(
+        jax.jit(q.augment)(jax.random.key(0), inputs, jnp.full(64, 2 * pushes[False][1] + 1))
+    )
     seen = set()
     for i, action in enumerate(actions.tolist()):
         mirrored = action // 2 != pushes[False][1]
         expected, cell = pushes[mirrored]
         assert action == 2 * cell + 1
-        window = q.input_fn(expected, jnp.int32(1))
+        window = look(expected, jnp.int32(1))
         np.testing.assert_allclose(windows.images[i], window.images, atol=1e-6)
         np.testing.assert_array_equal(windows.origin[i], window.origin)
         seen.add(mirrored)
@@ -176,13 +185,13 @@ def test_unguided_exploration_stays_where_the_network_has_values_on_both_sides(h
     config = NetworkConfig(architecture="compact", width=1 / 32, initial_bias=0.2, mirror=True)
     q = make_q_function(config, TaskConfig(full_ring=full_ring), ACTIONS)
     obs, params = observation(hand), drawn_params(q.init)
-    inputs = jax.tree.map(lambda leaf: leaf[None], q.input_fn(obs, jnp.int32(1)))
+    inputs = jax.tree.map(lambda leaf: np.asarray(leaf)[None], jax.jit(q.input_fn)(obs, jnp.int32(1)))
     assert q.mirror_fn is not None
-    values = jax.jit(q.network.apply)
-    here, there = (np.asarray(values({"params": params}, x))[0, ..., 0] for x in (inputs, q.mirror_fn(inputs)))
-    np.testing.assert_array_equal(q.domain_fn(obs.hand), (here != 0) & (there[::-1] != 0))
-    mask = grid.half_ring(obs.hand.xy, r_in=0.04, r_out=0.2, full=full_ring)
-    assert not (mask & ~q.domain_fn(obs.hand)).any()
+    values, domain = jax.jit(q.network.apply), np.asarray(jax.jit(q.domain_fn)(obs.hand))
+    here, there = (np.asarray(values({"params": params}, x))[0, ..., 0] for x in (inputs, jax.jit(q.mirror_fn)(inputs)))
+    np.testing.assert_array_equal(domain, (here != 0) & (there[::-1] != 0))
+    mask = grid.half_ring(np.array(hand, np.float32), r_in=0.04, r_out=0.2, full=full_ring)
+    assert not (mask & ~domain).any()
 
 
 def test_untrained_it_promises_its_bias_everywhere_and_learns_in_every_layer():
@@ -190,13 +199,14 @@ def test_untrained_it_promises_its_bias_everywhere_and_learns_in_every_layer():
     q = make_q_function(config.network, config.task, ACTIONS)
     params = jax.jit(q.init)(jax.random.key(0, impl="rbg"))
     assert num_parameters(params) == 117_922  # also the size that config.py and README name
-    values = jax.jit(q.values)(params, observation(START), jnp.int32(0))
-    mask = grid.half_ring(jnp.asarray(START), r_in=config.task.r_in, r_out=config.task.r_out)
+    values = np.asarray(jax.jit(q.values)(params, observation(START), jnp.int32(0)))
+    mask = grid.half_ring(np.array(START, np.float32), r_in=config.task.r_in, r_out=config.task.r_out)
     np.testing.assert_allclose(values[mask], 0.5, atol=0.05)
-    inputs = jax.tree.map(lambda x: x[None], q.input_fn(observation((-0.1025, 0.0025)), jnp.int32(0)))
+    look = jax.jit(q.input_fn)
+    inputs = jax.tree.map(lambda x: np.asarray(x)[None], look(observation((-0.1025, 0.0025)), jnp.int32(0)))
     gradient = jax.jit(jax.grad(lambda p: q.at(p, inputs, jnp.array([2 * (50 * 100 + 50)]))[0]))(params)
     flat = {"/".join(str(k.key) for k in path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(gradient)}
-    silent = {name for name, leaf in flat.items() if not np.any(leaf)}
+    silent = {name for name, leaf in flat.items() if not np.any(np.asarray(leaf))}
     assert all(name.startswith("block") and "_in/" in name for name in silent), silent
 
 
@@ -207,9 +217,9 @@ def test_paper_and_compact_answer_alike():
             NetworkConfig(architecture=architecture, width=1 / 32, initial_bias=0.2), TaskConfig(), ACTIONS
         )
         params = drawn_params(q.init)
-        values = jax.jit(q.values)(params, obs, jnp.int32(0))
-        inputs = jax.tree.map(lambda x: x[None], q.input_fn(obs, jnp.int32(0)))
-        action = jnp.array([ACTIONS.encode(jnp.int32(52), jnp.int32(40), jnp.int32(1))])
+        values = np.asarray(jax.jit(q.values)(params, obs, jnp.int32(0)))
+        inputs = jax.tree.map(lambda x: np.asarray(x)[None], jax.jit(q.input_fn)(obs, jnp.int32(0)))
+        action = np.array([ACTIONS.encode(np.int32(52), np.int32(40), np.int32(1))])
         np.testing.assert_allclose(jax.jit(q.at)(params, inputs, action)[0], values[52, 40, 1], rtol=1e-4)
         assert values.shape == (100, 100, 2) and values.dtype == jnp.float32
 
@@ -219,7 +229,7 @@ def test_the_mirror_image_of_a_turned_hand_has_the_other_choice():
     made = [Choice(name=str(k), z=0.1, yaw=yaw, aperture=1.0) for k, yaw in enumerate((0.4, 0.0, -0.4))]
     actions = ActionSpace(tuple(made), mirrored=(2, 1, 0))
     obs = observation((-0.1025, 0.0525))
-    reflected = Observation(obs.height[::-1], obs.instance_ids[::-1], hand_at((-0.1025, -0.0525)))
+    reflected = reflection(obs, (-0.1025, -0.0525))
     config = NetworkConfig(architecture="compact", width=1 / 16, mirror=True)
     q = make_q_function(config, TaskConfig(), actions)
     params, values = drawn_params(q.init), jax.jit(dataclasses.replace(q, mirror_fn=None).values)
@@ -228,7 +238,7 @@ def test_the_mirror_image_of_a_turned_hand_has_the_other_choice():
     reach = np.s_[30:90, 30:70]
     found = np.asarray(jax.jit(q.values)(params, obs, jnp.int32(1)))
     np.testing.assert_allclose(found[reach], ((here + there[::-1, :, ::-1]) / 2)[reach], rtol=1e-4, atol=1e-4)
-    push = int(actions.encode(jnp.int32(60), jnp.int32(40), jnp.int32(0)))
-    inputs = jax.tree.map(lambda leaf: jnp.stack([leaf] * 64), q.input_fn(obs, jnp.int32(1)))
-    _, augmented = q.augment(jax.random.key(0), inputs, jnp.full(64, push))
+    push = int(actions.encode(np.int32(60), np.int32(40), np.int32(0)))
+    inputs = jax.tree.map(lambda leaf: np.stack([leaf] * 64), jax.jit(q.input_fn)(obs, jnp.int32(1)))
+    _, augmented = jax.jit(q.augment)(jax.random.key(0), inputs, jnp.full(64, push))
     assert set(augmented.tolist()) == {push, 3 * (39 * 100 + 40) + 2}

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -85,10 +85,9 @@ def make_panel(tiles: Sequence[tuple[str, np.ndarray]], *, title: str = "") -> n
 
 def contact_sheet(bank: HullBank, eligible: np.ndarray, *, columns: int = 6) -> np.ndarray:
     """Draw every object of a bank with its name, size, mass, and whether it may be a target, `eligible` [N] bool."""
-    tiles = []
+    tiles, place, upright = [], jax.jit(object_hulls), np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]], np.float32)
     for index, name in enumerate(bank.names):
-        pose = jnp.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
-        hulls = object_hulls(bank, jnp.array([index]), pose)
+        hulls = place(bank, np.array([index]), upright)
         points = np.asarray(hulls.vertices)[np.asarray(hulls.present)].reshape(-1, 3)
         wide, deep, high = np.ptp(points, axis=0)
         # Wide enough for the tallest and widest objects that are taken, whichever way they are turned.
