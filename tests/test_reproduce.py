@@ -49,12 +49,17 @@ def test_the_ablations_are_those_of_the_paper_and_the_figure_shows_their_trainin
         "random exploration": {"exploration.guided": False},
     }
     assert spec.set["train.minutes"] == 30
+    as_far = experiments.make_spec(table, env_steps=3000)
+    checks.check(as_far)
+    assert as_far.set == {**spec.set, "train.env_steps": 3000, "train.minutes": 0}
 
 
 @pytest.mark.parametrize(
     ("name", "said"),
     [
         ("table3", "experiment = 'table3' does not exist; allowed: confined, figure4, table1, table2, transfer"),
+        ("table2 --budget 3 --env-steps 40", "budget = 3 and env_steps = 40 both say how long; allowed is one of them"),
+        ("table2 --env-steps -1", "train.env_steps = -1 is out of range"),
         ("table2 --seeds 1 1", "seeds = [1, 1] has a number twice"),
         ("table2 --parallel 900", "900 trials at a time do not fit"),
     ],
@@ -101,6 +106,7 @@ def test_the_page_has_the_papers_numbers_beside_ours(reproduced, tmp_path):
     cells = {label: re.findall(r"<td>(.*?)</td>", cells) for label, cells in rows[4:]}
     assert [cells[label][6] for label in experiment.variants] == ["93 %", "89 %", "85 %", "68 %"]
     assert cells["full method"][-1] == "reference" and re.search(r"points .*, p = ", cells["full ring"][-1])
+    assert "Preset ci, 300 pushes for each training, seeds 0, 1; 8 of 8 trials are done." in text
     assert cells["full method"][1].endswith(" %") and "band s0" in text and "are noise (95 %)" in text
     for sentence in experiment.differs:
         assert html.escape(sentence) in text

@@ -19,6 +19,7 @@ def reproduce(
     name: Annotated[str, tyro.conf.Positional],
     *,
     budget: float | None = None,
+    env_steps: int | None = None,
     size: Literal["budget", "paper"] = "budget",
     dir: Path | None = None,
     launcher: LauncherName = "local",
@@ -37,7 +38,9 @@ def reproduce(
 
     Args:
         name: of the experiment.
-        budget: minutes of training of each trial; the experiment's own if left out.
+        budget: minutes of training of each trial; the experiment's own if left out. On a machine that does other
+            things, too, some trials get further in them than others.
+        env_steps: pushes of each trial, instead of minutes: all get as far, whatever runs beside them.
         size: `budget` trains for minutes on CPUs, `paper` as long as the paper, which is meant for accelerators.
         dir: folder of the trainings; runs/reproduce/NAME if left out.
         launcher: as in `sweep start`.
@@ -52,8 +55,9 @@ def reproduce(
     """
     experiment = experiments.read_experiment(name)
     resources = {"cores": cores, "memory_gb": memory_gb, "gpu": gpu}
+    length = {"minutes": budget, "env_steps": env_steps}
     spec = experiments.make_spec(
-        experiment, size=size, minutes=budget, seeds=seeds, object_dir=object_dir, resources=resources
+        experiment, size=size, **length, seeds=seeds, object_dir=object_dir, resources=resources
     )
     path = dir or Path("runs/reproduce") / (experiment.runs if size == "budget" else f"{experiment.runs}-{size}")
     if only_page:

@@ -68,6 +68,7 @@ def make_spec(
     *,
     size: str = "budget",
     minutes: float | None = None,
+    env_steps: int | None = None,
     seeds: Sequence[int] | None = None,
     object_dir: Path | None = None,
     resources: Mapping[str, Any] | None = None,
@@ -78,15 +79,20 @@ def make_spec(
         experiment: which.
         size: `budget` for minutes of CPUs, `paper` for what the paper did.
         minutes: of training of each trial; those of the experiment, and for `paper` no limit, if None.
+        env_steps: of each trial instead of minutes, so that what runs beside it changes nothing.
         seeds: of every variant; those of the experiment if None.
         object_dir: folder of meshes of one's own, on which every variant is tested, too.
         resources: of a trial, as in a spec.
 
     Raises:
-        ValueError: no such size, or this version does not know a setting of the experiment.
+        ValueError: no such size, minutes and env steps, or this version does not know a setting of the experiment.
     """
     chosen = lookup(experiment.sizes, size, key="size")
-    if minutes is not None or size != "paper":
+    if minutes is not None and env_steps is not None:
+        raise ValueError(f"budget = {minutes:g} and env_steps = {env_steps} both say how long; allowed is one of them")
+    if env_steps is not None:
+        chosen = {**chosen, "set": {**chosen["set"], "train.env_steps": env_steps, "train.minutes": 0}}
+    elif minutes is not None or size != "paper":
         chosen = {**chosen, "set": {**chosen["set"], "train.minutes": minutes or experiment.minutes}}
     tests = dict(experiment.tests)
     if object_dir is not None:

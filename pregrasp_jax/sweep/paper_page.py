@@ -41,8 +41,8 @@ def _header(folder: SweepFolder, spec: Spec, experiment: Experiment) -> Iterator
     yield element("p", experiment.about)
     states = folder.states()
     words = list(driver.status(spec, states).values())
-    budget = spec.set.get("train.minutes")
-    length = f"{budget:g} minutes" if budget else "a whole run"
+    minutes, steps = spec.set.get("train.minutes"), spec.set.get("train.env_steps")
+    length = f"{minutes:g} minutes" if minutes else f"{steps} pushes" if steps else "a whole run"
     written = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
     text = (
         f"Preset {spec.preset}, {length} for each training, seeds {', '.join(map(str, spec.seeds))}; "
