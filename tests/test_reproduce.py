@@ -104,10 +104,18 @@ def test_the_page_has_the_papers_numbers_beside_ours(reproduced, tmp_path):
     rows = re.findall(r"<tr[^>]*><th scope=\"row\">([^<]*)</th>(.*?)</tr>", text)
     assert [label for label, _ in rows] == [*experiment.variants] * len(experiment.tests)
     cells = {label: re.findall(r"<td>(.*?)</td>", cells) for label, cells in rows[4:]}
-    assert [cells[label][6] for label in experiment.variants] == ["93 %", "89 %", "85 %", "68 %"]
-    assert cells["full method"][-1] == "reference" and re.search(r"points .*, p = ", cells["full ring"][-1])
+    paper = [cells[label][4] for label in experiment.variants]
+    assert paper == ["93 %, 2.51", "89 %, 3.04", "85 %, 3.20", "68 %, 3.38"]
+    assert cells["full method"][-3:] == ["reference", "", ""]
+    difference, p_value, better = cells["full ring"][-3:]
+    assert re.fullmatch(r"[+\u2212][\d.]+ \([+\u2212][\d.]+ to [+\u2212][\d.]+\)", difference), difference
+    assert 0 <= float(p_value) <= 1 and better.endswith(" %")
     assert "Preset ci, 300 pushes for each training, seeds 0, 1; 8 of 8 trials are done." in text
-    assert cells["full method"][1].endswith(" %") and "band s0" in text and "are noise (95 %)" in text
+    assert (
+        re.match(r"[\d.]+ % \(\d+ to \d+\)", cells["full method"][0])
+        and "band s0" in text
+        and "are noise (95 %)" in text
+    )
     for sentence in experiment.differs:
         assert html.escape(sentence) in text
 

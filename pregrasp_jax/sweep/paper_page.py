@@ -16,7 +16,7 @@ from pregrasp_jax.sweep.spec import Spec
 from pregrasp_jax.sweep.table import Row, Table, make_table
 from pregrasp_jax.sweep.worker import read_metrics
 
-_HEADER = ("", "seeds", "success", "95 % interval", "", "of each seed", "pushes", "paper", "its pushes", "difference")
+_HEADER = ("", "success (95 %)", "", "of each seed", "pushes", "paper", "difference, points", "p", "better in")
 
 
 def write_paper_page(folder: SweepFolder, spec: Spec, experiment: Experiment, path: Path) -> Path:
@@ -63,41 +63,41 @@ def _results(table: Table, rows: list[Row], tests: Iterable[str], experiment: Ex
             yield element("p", f"Differences within {100 * widest:.0f} points are noise (95 %).")
     text = (
         "Success is the mean over seeds, on the same scenes for all; intervals are of a bootstrap over seeds and "
-        "scenes. The difference is that from the reference, paired by scene, with its interval, p corrected by "
-        "Holm for the rows of the table, and how often a training of this row is better than one of the reference."
+        "scenes. The paper's numbers are success and mean pushes. The difference is that from the reference, paired by "
+        "scene, with its interval, p corrected by Holm for the rows of the table, and how often a training of this row "
+        "is better than one of the reference."
     )
     yield element("p", text, class_="soft")
 
 
 def _result_row(test: str, row: Row, table: Table, experiment: Experiment) -> Markup:
     found, paper = row.tests.get(test), experiment.paper.get(test, {}).get(row.label, {})
-    seeds = str(len(row.members)) if row.members[0].trial.policy is None else "as it is"
+    trained = row.members[0].trial.policy is None
     if found is None:
-        measured = [seeds, f"not yet ({row.word})", "", "", "", ""]
+        measured = [f"not yet ({row.word})", "", "", ""]
     else:
         measured = [
-            seeds,
-            f"{100 * found.rate:.1f} %",
-            "{:.0%} to {:.0%}".format(*found.interval),
+            "{:.1f} % ({:.0f} to {:.0f})".format(*(100 * share for share in (found.rate, *found.interval))),
             interval_mark(found.rate, *found.interval),
-            ", ".join(f"{100 * rate:.0f}" for rate in found.rates),
+            ", ".join(f"{100 * rate:.0f}" for rate in found.rates) if trained else "as it is",
             "" if found.motions is None else f"{found.motions:.2f}",
         ]
-    success = f"{paper['success']:g} %" if "success" in paper else ""
-    theirs = [success, f"{paper['motions']:.2f}" if "motions" in paper else ""]
+    theirs = [f"{paper['success']:g} %"] if "success" in paper else []
+    theirs += [f"{paper['motions']:.2f}"] if "motions" in paper else []
     own = row.label == table.reference
-    cells = [*measured, *theirs, "reference" if own else _difference(test, row, table)]
+    cells = [*measured, ", ".join(theirs), *(["reference", "", ""] if own else _difference(test, row, table))]
     name = element("th", row.label, scope="row")
     return element("tr", name, *(element("td", cell) for cell in cells), class_="own" if own else None)
 
 
-def _difference(test: str, row: Row, table: Table) -> str:
+def _difference(test: str, row: Row, table: Table) -> list[str]:
+    """Return the difference from the reference with its interval, p, and how often the row is the better one."""
     found = table.differences.get(test, {}).get(row.label)
     if found is None:
-        return ""
+        return ["", "", ""]
     low, high = found.interval
-    text = f"{100 * found.difference:+.1f} points ({100 * low:+.1f} to {100 * high:+.1f})"
-    return f"{text.replace('-', chr(0x2212))}, p = {found.p_value:.2g}, better in {100 * found.improvement:.0f} %"
+    text = f"{100 * found.difference:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})".replace("-", chr(0x2212))
+    return [text, f"{found.p_value:.2g}", f"{100 * found.improvement:.0f} %"]
 
 
 def _about_curves() -> Iterator[Markup]:
