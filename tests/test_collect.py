@@ -85,19 +85,7 @@ def test_a_grasp_that_is_tried_ends_the_same_episodes_and_pays_only_for_what_hol
 
 
 def test_tally_keeps_the_reasons_of_the_last_episodes():
-    window = 4
-    tally = collect.Tally(
-        env_steps=jnp.int32(0),
-        episodes=jnp.int32(0),
-        recent=jnp.full(window, -1, jnp.int8),
-        pushes=jnp.int32(0),
-        reward=jnp.float32(0),
-        explored=jnp.int32(0),
-        overflowed=jnp.int32(0),
-        diverged=jnp.int32(0),
-        reasons=jnp.zeros(len(PUSH_REASONS), jnp.int32),
-        obstructions=jnp.zeros(len(OBSTRUCTIONS), jnp.int32),
-    )
+    tally = collect.new_tally(4)
     success, truncated = PUSH_REASONS.index("target_in_region"), PUSH_REASONS.index("truncated")
     stopped, wall, error = (
         PUSH_REASONS.index("unreachable"),

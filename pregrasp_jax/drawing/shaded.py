@@ -73,18 +73,21 @@ def draw_camera(hulls: HullInstances, *, target_slot: int | None = None, camera:
 
 
 @jax.jit
-def _look(hulls: HullInstances, camera: Camera) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return depth m, hull (1 for the first, 0 for the table) and world point [3] of every pixel [rows, columns]."""
+def _look(hulls: HullInstances, camera: Camera) -> tuple[jax.Array, jax.Array]:
+    """Return which hull (1 for the first, 0 for the table) and which world point [3] is at every pixel."""
     labels = jnp.arange(1, hulls.labels.shape[0] + 1, dtype=jnp.uint8)
     depth, hull = render_pinhole(hulls.replace(labels=labels), camera)
-    return depth, hull, unproject(jnp.minimum(depth, _FARTHEST), camera)
+    return hull, unproject(jnp.minimum(depth, _FARTHEST), camera)
+
+
+_render = jax.jit(render_pinhole)
 
 
 def _shade(hulls: HullInstances, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return instance ids, brightness (1 = fully lit) and world points of every pixel."""
     num_hulls = hulls.labels.shape[0]
     assert num_hulls < 255, f"{num_hulls} hulls do not fit the 254 labels of a picture"
-    _, labels, points = map(np.asarray, _look(hulls, camera))
+    labels, points = map(np.asarray, _look(hulls, camera))
     normals = _normals(np.asarray(hulls.planes), labels, points)
     to_lamp = np.array(_LAMP) - points
     cosine = np.sum(normals * to_lamp, axis=-1) / np.linalg.norm(to_lamp, axis=-1)
@@ -107,7 +110,7 @@ def _normals(planes: np.ndarray, labels: np.ndarray, points: np.ndarray) -> np.n
 def _is_lit(hulls: HullInstances, points: np.ndarray) -> np.ndarray:
     """Return whether the lamp sees points [..., 3], by a depth image from the lamp; beyond its cone all is lit."""
     lamp = look_at(_LAMP, (-0.1, 0.0, 0.1), fovy=np.deg2rad(50.0), shape=(768, 768))
-    depth = np.asarray(_look(hulls, lamp)[0])
+    depth = np.asarray(_render(hulls, lamp)[0])
     local = (points - np.asarray(lamp.position)) @ np.asarray(lamp.rotation)
     distance = np.maximum(-local[..., 2], 1e-3)
     col = np.floor(local[..., 0] / distance * float(lamp.focal) + 384).astype(int)

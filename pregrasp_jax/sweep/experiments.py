@@ -85,15 +85,20 @@ def make_spec(
         resources: of a trial, as in a spec.
 
     Raises:
-        ValueError: no such size, minutes and env steps, or this version does not know a setting of the experiment.
+        ValueError: no such size, a length that is none, or this version does not know a setting of the experiment.
     """
     chosen = lookup(experiment.sizes, size, key="size")
     if minutes is not None and env_steps is not None:
         raise ValueError(f"budget = {minutes:g} and env_steps = {env_steps} both say how long; allowed is one of them")
+    for name, length in (("budget", minutes), ("env_steps", env_steps)):
+        if length is not None and length <= 0:
+            raise ValueError(f"{name} = {length} is out of range; allowed is more than 0")
+    if minutes is None and size != "paper":
+        minutes = experiment.minutes
     if env_steps is not None:
         chosen = {**chosen, "set": {**chosen["set"], "train.env_steps": env_steps, "train.minutes": 0}}
-    elif minutes is not None or size != "paper":
-        chosen = {**chosen, "set": {**chosen["set"], "train.minutes": minutes or experiment.minutes}}
+    elif minutes is not None:
+        chosen = {**chosen, "set": {**chosen["set"], "train.minutes": minutes}}
     tests = dict(experiment.tests)
     if object_dir is not None:
         meshes = object_dir.resolve()

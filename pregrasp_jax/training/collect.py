@@ -118,6 +118,22 @@ class Tally(struct.PyTreeNode):
         )
 
 
+def new_tally(window: int) -> Tally:
+    """Return the tally of a run that begins, which remembers `window` episodes."""
+    return Tally(
+        env_steps=jnp.int32(0),
+        episodes=jnp.int32(0),
+        recent=jnp.full(window, -1, jnp.int8),
+        pushes=jnp.int32(0),
+        reward=jnp.float32(0),
+        explored=jnp.int32(0),
+        overflowed=jnp.int32(0),
+        diverged=jnp.int32(0),
+        reasons=jnp.zeros(len(PUSH_REASONS), jnp.int32),
+        obstructions=jnp.zeros(len(OBSTRUCTIONS), jnp.int32),
+    )
+
+
 class Actors(struct.PyTreeNode):
     """State of the actors.
 
@@ -155,20 +171,8 @@ class Experience(struct.PyTreeNode):
 def init_actors(key: jax.Array, env: Environment, num_envs: int, *, vmap: VmapFn = jax.vmap) -> Actors:
     """Return `num_envs` scenes at the start of an episode; `vmap` is as in `make_collect`."""
     key, reset_key = jax.random.split(key)
-    tally = Tally(
-        env_steps=jnp.int32(0),
-        episodes=jnp.int32(0),
-        recent=jnp.full(max(RECENT_EPISODES, num_envs), -1, jnp.int8),
-        pushes=jnp.int32(0),
-        reward=jnp.float32(0),
-        explored=jnp.int32(0),
-        overflowed=jnp.int32(0),
-        diverged=jnp.int32(0),
-        reasons=jnp.zeros(len(PUSH_REASONS), jnp.int32),
-        obstructions=jnp.zeros(len(OBSTRUCTIONS), jnp.int32),
-    )
     states = vmap(env.reset)(jax.random.split(reset_key, num_envs))
-    return Actors(states, key, tally, no_mishap(states))
+    return Actors(states, key, new_tally(max(RECENT_EPISODES, num_envs)), no_mishap(states))
 
 
 def make_collect(
