@@ -20,6 +20,12 @@ compiling the push of `mjx` takes a worker that has been through other modules t
 
 PEAK = pytest.StashKey[int]()
 
+# The suite mostly waits for the compiler, which is done a third sooner if it optimises little. So do the programs that tests
+# start. `JAX_DISABLE_MOST_OPTIMIZATIONS=0 make test` tests the programs that everybody runs.
+if "JAX_DISABLE_MOST_OPTIMIZATIONS" not in os.environ:
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
+    jax.config.update("jax_disable_most_optimizations", True)
+
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update(
     "jax_compilation_cache_dir",
@@ -31,6 +37,18 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 @pytest.fixture
 def key() -> jax.Array:
     return jax.random.key(0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def optimise_physics(request: pytest.FixtureRequest) -> Generator[None]:
+    """Let the modules that step `mjx` compile as everybody does: hundreds of steps take longer than what is saved."""
+    if not request.path.name.startswith("test_mjx"):
+        yield
+        return
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

@@ -117,6 +117,7 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(collection, tmp_path):
     assert whole.evaluation["start_loss"] > 0 and whole.config == config
 
 
+@pytest.mark.slow
 def test_the_preset_collects_grasps_learns_from_them_and_is_evaluated(tmp_path, capfd):
     settings = {
         "scene.train-scenes": 4,

@@ -187,6 +187,7 @@ def test_a_slot_has_the_constants_of_a_separately_filled_model(model, oracle):
     )
 
 
+@pytest.mark.slow
 def test_the_least_overlapping_pairs_and_the_shallowest_contacts_are_dropped(bank, model, oracle, contacts_of, scenes):
     """Limits below the real counts, against the boxes of C's geoms and the contacts of which nothing was dropped."""
     object_ids, qpos = random_states(model, scenes, NUM_TIGHT)

@@ -63,6 +63,7 @@ def _assert_equal_runs(got: Path, expected: Path) -> None:
             np.testing.assert_array_equal(arrays[name], value, err_msg=name)
 
 
+@pytest.mark.slow
 def test_four_devices_split_scenes_and_batches_and_learn_what_one_learns(tmp_path):
     """Started, checkpointed and resumed; the memory starts the next batch from the errors of the last."""
     process = _train(tmp_path / "four" / "run", 0, devices=4)

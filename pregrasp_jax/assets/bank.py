@@ -215,10 +215,10 @@ def _finish(
     bank = HullBank(
         full=jax.tree.map(jnp.asarray, full),
         coarse=jax.tree.map(jnp.asarray, coarse),
-        object_hulls=jnp.asarray(object_hulls, jnp.int32),
+        object_hulls=jnp.asarray(object_hulls.astype(np.int32)),
         names=names,
         content_hash="",
-        **{key: jnp.asarray(value, jnp.float32) for key, value in rows.items()},
+        **{key: jnp.asarray(value.astype(np.float32)) for key, value in rows.items()},
     )
     digest = io.content_hash(FORMAT, list(names), *[np.asarray(leaf) for leaf in jax.tree.leaves(bank)])
     return bank.replace(content_hash=digest)

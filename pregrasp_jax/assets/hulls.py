@@ -98,9 +98,9 @@ def make_hulls(parts: Sequence[np.ndarray], topology: tuple[int, int, int]) -> H
     # Rounded before the faces are built, so that these do not depend on the last bits of a processor either.
     solids = [polytope(points.astype(np.float32).astype(np.float64)) for points in kept]
     return Hulls(
-        vertices=jnp.asarray(np.stack([_pad(s.vertices, topology[0]) for s in solids]), jnp.float32),
-        planes=jnp.asarray(np.stack([_pad(s.planes, topology[1]) for s in solids]), jnp.float32),
-        edges=jnp.asarray(np.stack([_pad(s.edges, topology[2]) for s in solids]), jnp.int32),
+        vertices=jnp.asarray(np.stack([_pad(s.vertices, topology[0]) for s in solids]).astype(np.float32)),
+        planes=jnp.asarray(np.stack([_pad(s.planes, topology[1]) for s in solids]).astype(np.float32)),
+        edges=jnp.asarray(np.stack([_pad(s.edges, topology[2]) for s in solids]).astype(np.int32)),
     )
 
 
