@@ -20,8 +20,8 @@ compiling the push of `mjx` takes a worker that has been through other modules t
 
 PEAK = pytest.StashKey[int]()
 
-# The suite mostly waits for the compiler, which is done a third sooner if it optimises little. So do the programs that tests
-# start. `JAX_DISABLE_MOST_OPTIMIZATIONS=0 make test` tests the programs that everybody runs.
+# The suite mostly waits for the compiler, which is done a third sooner if it optimises little. So do the programs that
+# tests start. `JAX_DISABLE_MOST_OPTIMIZATIONS=0 make test` tests the programs that everybody runs.
 if "JAX_DISABLE_MOST_OPTIMIZATIONS" not in os.environ:
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
     jax.config.update("jax_disable_most_optimizations", True)
