@@ -104,7 +104,7 @@ def test_small_differences_need_no_remark():
     assert again.remark() == made(0.0611, 0.9).remark()
 
 
-@pytest.mark.large  # CoACD's own, 2 GB and more for a mesh that it has to remesh
+@pytest.mark.slow  # and CoACD takes 2 GB and more for a mesh that it has to remesh
 def test_a_closed_mesh_that_crosses_itself_keeps_its_size(monkeypatch):
     for quick, value in {"threshold": 0.3, "resolution": 200, "mcts_nodes": 5, "mcts_iterations": 5}.items():
         monkeypatch.setitem(decompose._COACD, quick, value)

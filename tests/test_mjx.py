@@ -69,6 +69,7 @@ def plans():
     return [plan_push(ROBOT, TABLE, home, stroke, push_speed=0.1, num_rows=rows) for stroke in strokes]
 
 
+@pytest.mark.slow
 def test_kinematics_are_those_of_mjx_with_levels_that_are_not_fused(bank):
     """Every field, for a random posture; unfused, lest a pose is computed again and again (2.8 times the step)."""
     m = mjx_model.make_mjx_slot_model(bank, ROBOT, TABLE, limits=mjx.LIMITS, num_slots=NUM_SLOTS).mjx_model

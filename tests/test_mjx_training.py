@@ -40,16 +40,18 @@ SUCCESSES = (REASONS.index("target_in_region"),)
 FEW = SceneConfig(min_objects=2, max_objects=NUM_SLOTS, train_scenes=4)
 
 
-class Training(NamedTuple):
-    """A compiled iteration, what it calls on the host, how often a push was traced, and the state before and after two.
+class Built(NamedTuple):
+    """A training that is not compiled yet, and a note of every trace of a push."""
 
-    `host_calls` belongs to a test of its own, but is found while the trace is at hand, which takes longest.
-    """
+    program: program.Program
+    traces: list[int]
+
+
+class Training(NamedTuple):
+    """A compiled iteration and the state before and after two."""
 
     iterate: Any
     pace: Any
-    host_calls: list[str]
-    traces: list[int]
     before: program.TrainState
     after: program.TrainState
 
@@ -87,19 +89,34 @@ def host_calls(built: program.Program, *platforms: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def training() -> Training:
+def built() -> Built:
     traces = []
-    built = make_program(make_env(NUM_SLOTS, FEW, traces))
-    before = jax.jit(built.init)(jax.random.key(0))
-    iterate = built.compile(before).iterate
+    return Built(make_program(make_env(NUM_SLOTS, FEW, traces)), traces)
+
+
+def test_the_iteration_stays_on_an_accelerator(built):
+    assert host_calls(built.program, "cuda", "tpu") == []
+
+
+def test_with_the_native_engine_it_does_not():
+    """So the test above can fail. JAX refuses to lower a callback for a platform that this machine does not have."""
+    engine = native.make_engine(builtin_bank("seen"), ROBOT, TABLE)
+    assert host_calls(make_program(make_env(NUM_SLOTS, FEW, engine=engine)), "cpu")
+
+
+@pytest.fixture(scope="module")
+def training(built) -> Training:
+    before, pace = jax.jit(built.program.init)(jax.random.key(0)), built.program.pace
+    iterate = built.program.compile(before).iterate
     assert iterate is not None
     donated = jax.tree.map(jnp.copy, before)
-    after = iterate(donated, np.array([0, 2], np.int32), np.full(2, 0.4, np.float32), built.pace)
+    after = iterate(donated, np.array([0, 2], np.int32), np.full(2, 0.4, np.float32), pace)
     assert donated.actors.env_states.physics.qpos.is_deleted()
     assert donated.learning.replay.observations.height.is_deleted()
-    return Training(iterate, built.pace, host_calls(built, "cuda", "tpu"), traces, before, after)
+    return Training(iterate, pace, before, after)
 
 
+@pytest.mark.slow
 def test_two_iterations_push_remember_and_update(training):
     before, after = training.before, training.after
     report = collect.metrics(after.actors.tally, SUCCESSES)
@@ -113,6 +130,7 @@ def test_two_iterations_push_remember_and_update(training):
     assert np.isfinite(states.physics.qpos).all() and (states.physics.max_contacts > 0).any()
 
 
+@pytest.mark.slow
 def test_a_scene_that_diverges_ends_alone_is_counted_and_starts_anew(training):
     """The other scene does what it does beside a neighbour in good health."""
     states = training.before.actors.env_states
@@ -134,19 +152,10 @@ def test_a_scene_that_diverges_ends_alone_is_counted_and_starts_anew(training):
     assert healthy.num_pushes[1] == recovered.num_pushes[1]
 
 
-def test_a_push_is_traced_once(training):
+@pytest.mark.slow
+def test_a_push_is_traced_once(built, training):
     """For shapes, start and compilation, whatever objects the scenes then have."""
-    assert len(training.traces) == 1
-
-
-def test_the_iteration_stays_on_an_accelerator(training):
-    assert training.host_calls == []
-
-
-def test_with_the_native_engine_it_does_not():
-    """So the test above can fail. JAX refuses to lower a callback for a platform that this machine does not have."""
-    engine = native.make_engine(builtin_bank("seen"), ROBOT, TABLE)
-    assert host_calls(make_program(make_env(NUM_SLOTS, FEW, engine=engine)), "cpu")
+    assert len(built.traces) == 1
 
 
 @pytest.fixture(scope="module")

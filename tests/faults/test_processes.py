@@ -71,8 +71,8 @@ def assert_equal_runs(trainer: Trainer, whole: Trainer) -> None:
     [
         ("collect", 6, 5),
         pytest.param("update", 2, 5, marks=pytest.mark.slow),
-        (".npz", 4, 3),
-        ("state.safetensors", 1, None),
+        pytest.param(".npz", 4, 3, marks=pytest.mark.slow),
+        pytest.param("state.safetensors", 1, None, marks=pytest.mark.slow),
         pytest.param("manifest.json", 6, 3, marks=pytest.mark.slow),
     ],
 )
