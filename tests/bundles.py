@@ -5,13 +5,18 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from drawn_params import drawn_params
 
 from pregrasp_jax.checkpoint import TrainedPolicy, load_policy, save_policy
 from pregrasp_jax.config import Config, NetworkConfig, TaskConfig
+from pregrasp_jax.deploy.bundle import Bundle, read_bundle
+from pregrasp_jax.deploy.camera import PinholeCamera
+from pregrasp_jax.deploy.golden import golden_view
+from pregrasp_jax.deploy.view import View
 from pregrasp_jax.export.bundle import export_policy
 from pregrasp_jax.learning.q_function import QFunction, make_q_function
-from pregrasp_jax.robot import get_robot
+from pregrasp_jax.robot import get_robot, robot_file
 from pregrasp_jax.task.push import push_actions
 
 ACTIONS = push_actions(get_robot("ur5e_rg2"))
@@ -37,3 +42,30 @@ def small_bundle() -> Path:
     policy = random_policy(folder / "policy", Config(network=network, task=TaskConfig()))
     export_policy(policy, folder / "bundle", golden=2)
     return folder / "bundle"
+
+
+class Small:
+    """What is in the small bundle, read when it is first asked for: tests are collected without making it."""
+
+    @functools.cached_property
+    def bundle(self) -> Bundle:
+        return read_bundle(small_bundle())
+
+    @functools.cached_property
+    def golden(self) -> dict[str, np.ndarray]:
+        return self.bundle.arrays("golden.npz")
+
+    @functools.cached_property
+    def view(self) -> View:
+        return golden_view(self.golden)
+
+    @property
+    def camera(self) -> PinholeCamera:
+        return self.view.camera
+
+    @functools.cached_property
+    def body(self) -> robot_file.Body:
+        return robot_file.from_arrays(self.bundle.arrays("robot.npz"))
+
+
+SMALL = Small()

@@ -14,9 +14,9 @@ from pathlib import Path
 import jax
 import pytest
 
-MAX_MB = 2400
+MAX_MB = 2600
 """Resident memory that a worker may ever have: four of them, and what they start, fit into 16 GB. Compiling the push of
-`mjx` takes 2200, all else less than 2000."""
+`mjx` takes 2150 on its own; all else stays below 2100."""
 
 PEAK = pytest.StashKey[int]()
 

@@ -1,6 +1,5 @@
 """A whole cell by the command line, dry: files in, a push out, a log, its pictures; and the check of a calibration."""
 
-import functools
 import json
 import re
 from pathlib import Path
@@ -8,48 +7,33 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from bundles import small_bundle
+from bundles import SMALL, small_bundle
 from PIL import Image
 
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.deploy.bundle import read_bundle
-from pregrasp_jax.deploy.camera import PinholeCamera
-from pregrasp_jax.deploy.golden import golden_view
 
 ROOT = Path(__file__).parent.parent
 INTRINSICS = [[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]
 
 
-@functools.cache
-def golden() -> dict[str, np.ndarray]:
-    """Return the golden pushes of the small bundle."""
-    return read_bundle(small_bundle()).arrays("golden.npz")
-
-
-@functools.cache
-def camera_of_golden() -> PinholeCamera:
-    """Return the camera that took the golden images."""
-    return golden_view(golden()).camera
-
-
 def write_cell(folder: Path, *, tilt_deg: float = 0.0, **sections: object) -> Path:
     """Write a cell.yaml for the camera of the golden images, and what it names."""
-    pose = camera_of_golden().world_from_optical.copy()
+    pose = SMALL.camera.world_from_optical.copy()
     angle = np.deg2rad(tilt_deg)
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     pose[:3, :3] = turn @ pose[:3, :3]
     camera = {
-        "intrinsics": camera_of_golden().matrix.tolist(),
+        "intrinsics": SMALL.camera.matrix.tolist(),
         "extrinsics": pose.tolist(),
         "parent": "table",
         "depth": "depth.npy",
     }
-    np.save(folder / "depth.npy", golden()["depth"][0])
-    Image.fromarray(golden()["instances"][0]).save(folder / "ids.png")
+    np.save(folder / "depth.npy", SMALL.golden["depth"][0])
+    Image.fromarray(SMALL.golden["instances"][0]).save(folder / "ids.png")
     cell = {
         "camera": camera | {"depth_scale": 1e-4},
         "segmenter": {"kind": "file", "file": "ids.png"},
-        "target": {"name": str(int(golden()["target_id"][0]))},
+        "target": {"name": str(int(SMALL.golden["target_id"][0]))},
     }
     (folder / "cell.yaml").write_text(yaml.safe_dump(cell | sections))
     return folder / "cell.yaml"
@@ -61,7 +45,7 @@ def test_a_dry_trial_is_decided_logged_and_drawn(tmp_path: Path, capsys):
     said = capsys.readouterr().out
     assert "push 1: hand" in said and "dry: moveL([" in said and "once after 1 pushes" in said
     about = json.loads((log / "decision-000.json").read_text())
-    assert about["push"]["action"] == golden()["action"][0] and about["close"] is False
+    assert about["push"]["action"] == SMALL.golden["action"][0] and about["close"] is False
     assert set(about["times_ms"]) == {
         "segmentation",
         "reading",
@@ -71,9 +55,9 @@ def test_a_dry_trial_is_decided_logged_and_drawn(tmp_path: Path, capsys):
         "network",
         "decoding",
     }
-    np.testing.assert_allclose(about["push"]["end_table_m"][:2], golden()["push"][0, :2], atol=1e-6)
+    np.testing.assert_allclose(about["push"]["end_table_m"][:2], SMALL.golden["push"][0, :2], atol=1e-6)
     with np.load(log / "decision-000.npz") as held:
-        assert np.abs(held["q"] - golden()["q"][0]).max() < 0.2 and held["depth"].dtype == np.uint16
+        assert np.abs(held["q"] - SMALL.golden["q"][0]).max() < 0.2 and held["depth"].dtype == np.uint16
     assert json.loads((log / "result.json").read_text()) == {"reason": "once", "pushes": 1}
     assert main(["deploy", "--replay", str(log)]) == 0
     with Image.open(log / "decision-000.png") as picture:
@@ -105,7 +89,7 @@ def test_what_a_cell_lacks_is_one_line(tmp_path: Path, sections: dict, said: str
 
 
 def test_the_tabletop_segmenter_finds_the_target_by_a_pixel(tmp_path: Path, capsys):
-    rows, columns = np.nonzero(golden()["instances"][0] == golden()["target_id"][0])
+    rows, columns = np.nonzero(SMALL.golden["instances"][0] == SMALL.golden["target_id"][0])
     pixel = [int(np.median(columns)), int(np.median(rows))]
     cell = write_cell(tmp_path, segmenter={"kind": "tabletop"}, target={"pixel": pixel})
     assert main(["deploy", str(small_bundle()), "--config", str(cell), "--once", "True"]) == 0
@@ -115,7 +99,7 @@ def test_the_tabletop_segmenter_finds_the_target_by_a_pixel(tmp_path: Path, caps
 @pytest.mark.parametrize(("tilt", "code"), [(0.0, 0), (1.0, 1)])
 def test_a_calibration_is_checked_against_the_table(tmp_path: Path, tilt: float, code: int, capsys):
     cell = write_cell(tmp_path, tilt_deg=tilt)
-    Image.fromarray(np.full(camera_of_golden().shape, 10_000, np.uint16)).save(tmp_path / "empty.png")
+    Image.fromarray(np.full(SMALL.camera.shape, 10_000, np.uint16)).save(tmp_path / "empty.png")
     files = ["--depth", str(tmp_path / "empty.png"), "--png", str(tmp_path / "check.png")]
     assert main(["calibrate-check", str(cell), "--bundle", str(small_bundle()), *files]) == code
     said = capsys.readouterr().out

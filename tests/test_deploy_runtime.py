@@ -10,15 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bundles import small_bundle
+from bundles import SMALL, small_bundle
 
 from pregrasp_jax import heightmap
 from pregrasp_jax.config import TaskConfig
-from pregrasp_jax.deploy.bundle import read_bundle
 from pregrasp_jax.deploy.camera import PinholeCamera, depth_in_metres
 from pregrasp_jax.deploy.decision import Decider, allowed_pushes, workspace_of
 from pregrasp_jax.deploy.files import masks_of_ids, read_masks
-from pregrasp_jax.deploy.golden import golden_view
 from pregrasp_jax.deploy.masks import Masks, Target, from_mask_rcnn, fuse
 from pregrasp_jax.deploy.policy import load_values
 from pregrasp_jax.deploy.projection import Maps, draw_robot, project, to_maps
@@ -26,7 +24,7 @@ from pregrasp_jax.deploy.tabletop import components
 from pregrasp_jax.deploy.view import make_view
 from pregrasp_jax.geometry import rigid_inverse
 from pregrasp_jax.heightmap.views import project_upward
-from pregrasp_jax.robot import clearance, description, get_robot, kinematics, robot_file
+from pregrasp_jax.robot import clearance, description, get_robot, kinematics
 from pregrasp_jax.robot.following import follow
 from pregrasp_jax.sensors import PointOfCell
 from pregrasp_jax.spaces.workspace import TABLE, Box, Workspace
@@ -34,12 +32,6 @@ from pregrasp_jax.task.push import make_push
 from pregrasp_jax.types import OBSTRUCTIONS
 
 ROBOT = get_robot("ur5e_rg2")
-BUNDLE = read_bundle(small_bundle())
-GOLDEN = BUNDLE.arrays("golden.npz")
-VIEW = golden_view(GOLDEN)
-CAMERA = VIEW.camera
-BODY = robot_file.from_arrays(BUNDLE.arrays("robot.npz"))
-LABELS = BUNDLE.contract.grid.labels
 WALLED = Workspace(name="walled", walls=(Box(center=(0.0, 0.32, 0.1), half_size=(0.3, 0.02, 0.1), yaw=0.1),))
 
 DECIDE = """
@@ -82,27 +74,27 @@ def random_joints(count: int) -> np.ndarray:
 def test_kinematics_of_numpy_are_those_of_jax():
     assert ROBOT.body
     joints, arm = random_joints(20), ROBOT.body.arm
-    flange = np.stack([kinematics.forward_kinematics(BODY.arm, row[:6])[-1] for row in joints])
+    flange = np.stack([kinematics.forward_kinematics(SMALL.body.arm, row[:6])[-1] for row in joints])
     forward = jax.jit(jax.vmap(lambda q: kinematics.forward_kinematics(arm, q)[-1]))
     wanted = np.asarray(forward(jnp.asarray(joints[:, :6])))
     np.testing.assert_allclose(flange, wanted, atol=2e-6)
-    found = kinematics.inverse_kinematics(BODY.arm, flange)
+    found = kinematics.inverse_kinematics(SMALL.body.arm, flange)
     inverse = jax.jit(jax.vmap(lambda pose: kinematics.inverse_kinematics(arm, pose)))
     solved = np.asarray(inverse(jnp.asarray(flange, jnp.float32)))
     np.testing.assert_array_equal(np.isnan(found), np.isnan(solved))
     turn = np.angle(np.exp(1j * (found - solved)))
     assert np.nanmax(np.abs(turn)) < 5e-3, "float32 of jax near singular postures"
     links = jax.jit(ROBOT.links.matrices)(jnp.asarray(joints[0]))
-    np.testing.assert_allclose(BODY.links.matrices(joints.astype(float))[0], np.asarray(links), atol=2e-6)
+    np.testing.assert_allclose(SMALL.body.links.matrices(joints.astype(float))[0], np.asarray(links), atol=2e-6)
 
 
 def test_clearance_of_numpy_is_that_of_jax():
     joints = random_joints(12)
     for measure, geoms, rest in (
-        (clearance.height_above_table, BODY.above_table, ()),
-        (clearance.distance_to_walls, BODY.moving, (WALLED,)),
+        (clearance.height_above_table, SMALL.body.above_table, ()),
+        (clearance.distance_to_walls, SMALL.body.moving, (WALLED,)),
     ):
-        own = measure(BODY.links, geoms, joints.astype(float), *rest)
+        own = measure(SMALL.body.links, geoms, joints.astype(float), *rest)
         of_jax = jax.jit(jax.vmap(lambda q, m=measure, r=rest, g=geoms: m(ROBOT.links, g, q, *r)))
         np.testing.assert_allclose(own, np.asarray(of_jax(jnp.asarray(joints))), atol=1e-5)
 
@@ -116,7 +108,7 @@ def test_what_keeps_the_hand_from_a_path_is_the_same(place: Workspace):
         share = np.linspace(0, 1, 30)[:, None]
         poses[:, :3], poses[:, 3] = np.array([-0.3, 0, 0.1]) + share * (np.array([x, y, z]) - [-0.3, 0, 0.1]), 1.0
         apertures = np.full(30, 1.2)
-        found = follow(BODY, np.array(ROBOT.home[:6], float), poses, apertures, place, dt=0.02)
+        found = follow(SMALL.body, np.array(ROBOT.home[:6], float), poses, apertures, place, dt=0.02)
         controls, code = jitted(
             jnp.asarray(ROBOT.home), jnp.asarray(poses, jnp.float32), jnp.asarray(apertures, jnp.float32), place
         )
@@ -139,10 +131,10 @@ def upward(depth: jax.Array, labels: jax.Array, *, cell: str = "max") -> tuple[j
 @pytest.mark.parametrize("cell", ["max", "second", "median"])
 def test_projection_is_that_of_the_package(cell: PointOfCell):
     rng = np.random.default_rng(3)
-    depth = (1.0 - rng.random(CAMERA.shape) * 0.3).astype(np.float32)
+    depth = (1.0 - rng.random(SMALL.camera.shape) * 0.3).astype(np.float32)
     depth[rng.random(depth.shape) < 0.3] = np.nan
     labels = rng.integers(0, 3, depth.shape).astype(np.uint8)
-    maps = to_maps(VIEW.cut(depth), VIEW.cut(labels), view=VIEW, cell=cell)
+    maps = to_maps(SMALL.view.cut(depth), SMALL.view.cut(labels), view=SMALL.view, cell=cell)
     height, wanted = upward(jnp.asarray(depth), jnp.asarray(labels), cell=cell)
     off = np.abs(maps.height_m - np.asarray(height))
     assert (off <= 1e-5).mean() > 0.997, "but for pixels on the border of two cells"
@@ -160,14 +152,17 @@ def test_projection_is_that_of_the_package(cell: PointOfCell):
     ],
 )
 def test_what_is_above_the_hand_stays_and_what_is_the_hand_becomes_it(nearer, label, robot):
-    shape, joints = VIEW.rays.shape[1:], GOLDEN["joint_pos"][-1]
-    hand, nothing = np.full(shape, np.nan, np.float32), np.full(shape, LABELS["table"], np.uint8)
-    draw_robot(hand, nothing, view=VIEW, body=BODY, joint_pos=joints, entry=BUNDLE.contract.grid)
-    covered = nothing == LABELS["robot"]
+    shape, joints = SMALL.view.rays.shape[1:], SMALL.golden["joint_pos"][-1]
+    hand, nothing = (
+        np.full(shape, np.nan, np.float32),
+        np.full(shape, SMALL.bundle.contract.grid.labels["table"], np.uint8),
+    )
+    draw_robot(hand, nothing, view=SMALL.view, body=SMALL.body, joint_pos=joints, entry=SMALL.bundle.contract.grid)
+    covered = nothing == SMALL.bundle.contract.grid.labels["robot"]
     assert covered.sum() > 1000
-    depth, labels = hand - np.float32(nearer), np.full(shape, LABELS[label], np.uint8)
-    draw_robot(depth, labels, view=VIEW, body=BODY, joint_pos=joints, entry=BUNDLE.contract.grid)
-    assert (labels[covered] == LABELS["robot" if robot else label]).all()
+    depth, labels = hand - np.float32(nearer), np.full(shape, SMALL.bundle.contract.grid.labels[label], np.uint8)
+    draw_robot(depth, labels, view=SMALL.view, body=SMALL.body, joint_pos=joints, entry=SMALL.bundle.contract.grid)
+    assert (labels[covered] == SMALL.bundle.contract.grid.labels["robot" if robot else label]).all()
     np.testing.assert_allclose(depth[covered], hand[covered] - (0 if robot else nearer), atol=1e-6)
 
 
@@ -175,59 +170,64 @@ def test_the_robot_is_drawn_where_the_package_draws_it():
     def render(joint_pos: jax.Array) -> tuple[jax.Array, jax.Array]:
         return heightmap.render_pinhole(heightmap.robot_hulls(ROBOT, joint_pos), heightmap.overhead_camera())
 
-    depth, ids = jax.jit(render)(jnp.asarray(GOLDEN["joint_pos"][-1]))
-    blank = np.full(CAMERA.shape, np.nan, np.float32)
-    nothing = np.zeros(CAMERA.shape, np.uint8)
-    joints = GOLDEN["joint_pos"][-1]
-    about = {"view": VIEW, "body": BODY, "joint_pos": joints, "entry": BUNDLE.contract.grid}
+    depth, ids = jax.jit(render)(jnp.asarray(SMALL.golden["joint_pos"][-1]))
+    blank = np.full(SMALL.camera.shape, np.nan, np.float32)
+    nothing = np.zeros(SMALL.camera.shape, np.uint8)
+    joints = SMALL.golden["joint_pos"][-1]
+    about = {"view": SMALL.view, "body": SMALL.body, "joint_pos": joints, "entry": SMALL.bundle.contract.grid}
     drawn = project(blank, nothing, **about)
     height, shown = upward(jnp.where(ids > 0, depth, jnp.nan), ids)
-    robot, wanted = drawn.labels == LABELS["robot"], np.asarray(shown) > 0
+    robot, wanted = drawn.labels == SMALL.bundle.contract.grid.labels["robot"], np.asarray(shown) > 0
     assert wanted.sum() > 100 and (robot != wanted).sum() <= 0.02 * wanted.sum()
     both = robot & wanted
     assert (np.abs(drawn.height_m - np.asarray(height))[both] < 1e-3).mean() > 0.98
 
 
 def test_an_object_above_the_robot_is_not_painted_over():
-    joints = GOLDEN["joint_pos"][-1]
-    high = np.full(CAMERA.shape, 0.3, np.float32)  # 0.7 m above the table everywhere
-    labels = np.full(CAMERA.shape, LABELS["target"], np.uint8)
-    about = {"view": VIEW, "body": BODY, "joint_pos": joints, "entry": BUNDLE.contract.grid}
+    joints = SMALL.golden["joint_pos"][-1]
+    high = np.full(SMALL.camera.shape, 0.3, np.float32)  # 0.7 m above the table everywhere
+    labels = np.full(SMALL.camera.shape, SMALL.bundle.contract.grid.labels["target"], np.uint8)
+    about = {"view": SMALL.view, "body": SMALL.body, "joint_pos": joints, "entry": SMALL.bundle.contract.grid}
     maps = project(high, labels, **about)
-    assert (maps.labels == LABELS["target"]).any() and not (maps.labels == LABELS["robot"]).any()
+    assert (maps.labels == SMALL.bundle.contract.grid.labels["target"]).any() and not (
+        maps.labels == SMALL.bundle.contract.grid.labels["robot"]
+    ).any()
 
 
 @pytest.fixture(scope="module")
 def decider() -> Decider:
     return Decider(
-        contract=BUNDLE.contract, values=load_values(BUNDLE), body=BODY, workspace=workspace_of(BUNDLE.contract)
+        contract=SMALL.bundle.contract,
+        values=load_values(SMALL.bundle),
+        body=SMALL.body,
+        workspace=workspace_of(SMALL.bundle.contract),
     )
 
 
 def golden_maps(index: int) -> Maps:
-    return Maps(GOLDEN["height_m"][index], GOLDEN["labels"][index], 1.0)
+    return Maps(SMALL.golden["height_m"][index], SMALL.golden["labels"][index], 1.0)
 
 
 def joints_of(index: int) -> np.ndarray:
-    return GOLDEN["joint_pos"][index]
+    return SMALL.golden["joint_pos"][index]
 
 
 def test_pushes_are_the_golden_ones(decider: Decider):
     for index in range(2):
-        hand = decider.start()._replace(xy=GOLDEN["p1_m"][index].astype(float))
+        hand = decider.start()._replace(xy=SMALL.golden["p1_m"][index].astype(float))
         found = decider.decide(golden_maps(index), hand, joints_of(index))
         assert not found.close and found.push is not None and not found.refused
-        assert found.push.action == GOLDEN["action"][index]
+        assert found.push.action == SMALL.golden["action"][index]
         end = [*found.push.end.xy, found.push.end.z, found.push.end.yaw, found.push.end.aperture]
-        np.testing.assert_allclose(end, GOLDEN["push"][index], atol=1e-6)
+        np.testing.assert_allclose(end, SMALL.golden["push"][index], atol=1e-6)
         np.testing.assert_allclose(found.push.poses[-1, :2], found.push.end.xy, atol=1e-9)
-        in_base = rigid_inverse(BODY.arm.world_from_base) @ [*found.push.poses[-1, :3], 1.0]
+        in_base = rigid_inverse(SMALL.body.arm.world_from_base) @ [*found.push.poses[-1, :3], 1.0]
         np.testing.assert_allclose(found.push.base_pose[:3], in_base[:3], atol=1e-6)
 
 
 def test_allowed_pushes_are_those_of_the_primitive(decider: Decider):
     push = make_push(ROBOT, TABLE, TaskConfig(), max_distance=0.2)
-    own = allowed_pushes(BUNDLE.contract.action, decider.start())
+    own = allowed_pushes(SMALL.bundle.contract.action, decider.start())
     np.testing.assert_array_equal(own, np.asarray(push.mask(jax.tree.map(jnp.asarray, ROBOT.start))))
 
 
@@ -243,14 +243,14 @@ def test_a_push_that_the_arm_cannot_make_is_passed_over(decider: Decider):
 
 
 def test_the_fingers_close_on_a_target_between_them(decider: Decider):
-    pose = kinematics.grasp_pose(BODY.arm, np.asarray(joints_of(0)[:6], float))
+    pose = kinematics.grasp_pose(SMALL.body.arm, np.asarray(joints_of(0)[:6], float))
     for shift, close in ((0.0, True), (0.06, False)):
         labels = np.zeros((100, 100), np.uint8)
         row, col = int((pose[1] + 0.25 + shift) / 0.005), int((pose[0] + 0.25) / 0.005)
         maps = Maps(np.zeros((100, 100), np.float32), labels, 1.0)
         inside = slice(max(col - 2, 0), max(col + 3, 1))
-        labels[row - 3 : row + 4, inside] = LABELS["target"]
-        if not (labels == LABELS["target"]).any():
+        labels[row - 3 : row + 4, inside] = SMALL.bundle.contract.grid.labels["target"]
+        if not (labels == SMALL.bundle.contract.grid.labels["target"]).any():
             pytest.skip("the hand is outside of the picture")
         hand = decider.start()._replace(xy=pose[:2])
         found = decider.decide(maps, hand, joints_of(0))
@@ -267,7 +267,7 @@ def test_joints_that_cannot_be_are_refused(decider: Decider):
     ):
         with pytest.raises(ValueError, match=said):
             decider.decide(golden_maps(0), decider.start(), joints)
-    empty = Maps(GOLDEN["height_m"][0], np.zeros((100, 100), np.uint8), 1.0)
+    empty = Maps(SMALL.golden["height_m"][0], np.zeros((100, 100), np.uint8), 1.0)
     with pytest.raises(ValueError, match="no cell of the map shows the target"):
         decider.decide(empty, decider.start(), joints_of(0))
 
@@ -293,21 +293,21 @@ def test_depth_is_metres_whatever_it_came_as():
 
 
 def camera_at(position=(0.0, 0.0, 1.0), **changes) -> PinholeCamera:
-    pose = CAMERA.world_from_optical.copy()
+    pose = SMALL.camera.world_from_optical.copy()
     pose[:3, 3] = position
-    given = {"matrix": CAMERA.matrix, "world_from_optical": pose, "shape": CAMERA.shape} | changes
+    given = {"matrix": SMALL.camera.matrix, "world_from_optical": pose, "shape": SMALL.camera.shape} | changes
     return PinholeCamera(**given)
 
 
 def test_cameras_that_cannot_be_are_refused():
-    tilted = CAMERA.world_from_optical.copy()
+    tilted = SMALL.camera.world_from_optical.copy()
     tilted[:3, :3] *= 1.01
     for changes, said in (
         ({"world_from_optical": tilted}, "no rotation"),
         ({"position": (0.0, 0.0, -0.5)}, "below the table"),
         ({"position": (0.0, 0.0, 1000.0)}, "millimetres"),
         ({"matrix": np.eye(3)}, "intrinsics"),
-        ({"matrix": CAMERA.matrix.T}, "intrinsics"),
+        ({"matrix": SMALL.camera.matrix.T}, "intrinsics"),
         ({"distortion": (0.0,)}, "five numbers"),
         ({"shape": (100, 100)}, "principal point"),
     ):
@@ -321,13 +321,13 @@ def test_cameras_that_cannot_be_are_refused():
 def test_a_bent_lens_is_straightened():
     bent = camera_at(distortion=(-0.056, 0.060, 0.0004, 0.0007, -0.016))  # a D455's
     rays = bent.rays(slice(0, 480), slice(0, 640))
-    turn = CAMERA.world_from_optical[:3, :3]
+    turn = SMALL.camera.world_from_optical[:3, :3]
     x, y, _ = np.tensordot(turn.T, rays, axes=1)
     k1, k2, p1, p2, k3 = bent.distortion
     r2 = x**2 + y**2
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    u = CAMERA.matrix[0, 0] * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)) + CAMERA.matrix[0, 2]
-    v = CAMERA.matrix[1, 1] * (y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y) + CAMERA.matrix[1, 2]
+    u = SMALL.camera.matrix[0, 0] * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)) + SMALL.camera.matrix[0, 2]
+    v = SMALL.camera.matrix[1, 1] * (y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y) + SMALL.camera.matrix[1, 2]
     columns, rows = np.meshgrid(np.arange(640), np.arange(480))
     assert max(np.abs(u - columns).max(), np.abs(v - rows).max()) < 1e-2
 
@@ -365,9 +365,12 @@ def detections(count: int = 3) -> dict:
 def test_mask_rcnn_as_torchvision_gives_it():
     masks = from_mask_rcnn([detections()], {44: "bottle", 47: "cup"})
     assert masks.names == ("bottle", "cup") and masks.masks.dtype == bool, "the third is not sure enough"
-    image = fuse(masks, 1, LABELS, (40, 40))
-    assert image[12, 10] == LABELS["obstacle"], "where they overlap the surer one counts"
-    assert image[15, 10] == LABELS["target"] and image[0, 0] == LABELS["table"]
+    image = fuse(masks, 1, SMALL.bundle.contract.grid.labels, (40, 40))
+    assert image[12, 10] == SMALL.bundle.contract.grid.labels["obstacle"], "where they overlap the surer one counts"
+    assert (
+        image[15, 10] == SMALL.bundle.contract.grid.labels["target"]
+        and image[0, 0] == SMALL.bundle.contract.grid.labels["table"]
+    )
     assert Target(name="cup").find(masks) == 1 == Target(pixel=(10, 16)).find(masks) == Target(index=1).find(masks)
     nothing = from_mask_rcnn([detections(0)])
     assert nothing.masks.shape == (0, 40, 40)
@@ -390,10 +393,10 @@ def test_targets_and_masks_that_are_not_there_are_refused(tmp_path: Path):
     with pytest.raises(ValueError, match="allowed is one of"):
         Target(index=1, name="mug")
     with pytest.raises(ValueError, match="allowed is N x 30 x 40"):
-        fuse(masks, 0, LABELS, (30, 40))
+        fuse(masks, 0, SMALL.bundle.contract.grid.labels, (30, 40))
     hidden = Masks(np.stack([masks.masks[0], masks.masks[0]]), ("a", "b"), np.array([0.9, 0.8]))
     with pytest.raises(ValueError, match="0 visible pixels"):
-        fuse(hidden, 1, LABELS, (40, 40))
+        fuse(hidden, 1, SMALL.bundle.contract.grid.labels, (40, 40))
     for output in ([], {"labels": [1]}, {"labels": [1], "masks": np.zeros((2, 3, 4, 5))}):
         with pytest.raises(ValueError, match="Mask R-CNN"):
             from_mask_rcnn(output)
