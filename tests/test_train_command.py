@@ -56,6 +56,8 @@ import hashlib, os, sys, time
 from pregrasp_jax.training.interrupt import Interrupt
 
 def say(line):
+    if sys.argv[1] == "slow" and line.startswith("stopping"):
+        time.sleep(0.3)
     print(line + "\\n", end="", flush=True)  # in one piece: the signal is answered in a thread of its own
 
 with Interrupt(say, lambda: say("cursor back")) as interrupt:
@@ -84,6 +86,13 @@ def test_the_first_signal_asks_the_loop_to_stop(number, code):
     process.send_signal(number)
     output, _ = process.communicate(timeout=20)
     assert process.returncode == code and "stopping" in output and output.endswith("stopped by the loop\n")
+
+
+def test_the_answer_to_a_signal_is_finished_though_the_loop_ends_before():
+    process = _listener("slow")
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate(timeout=20)
+    assert process.returncode == 143 and "stopping: this step is finished" in output
 
 
 def test_a_signal_counts_though_it_cannot_be_answered():

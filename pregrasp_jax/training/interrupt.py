@@ -10,6 +10,10 @@ from types import FrameType
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
+SECONDS_TO_ANSWER = 1.0
+"""How long the end of a loop waits for the answer to a signal: a console that takes nothing is not waited for longer."""
+
+
 class Interrupt:
     """Listens for signals while it is entered (in the main thread).
 
@@ -40,15 +44,17 @@ class Interrupt:
         self._writer.setblocking(False)
         self._old_handlers = {number: signal.signal(number, _ignore) for number in SIGNALS}
         self._old_fd = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
-        threading.Thread(target=self._listen, daemon=True).start()
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop listening."""
+        """Stop listening; an answer under way is finished, lest the interpreter ends while its line is written."""
         signal.set_wakeup_fd(self._old_fd)
         for number, handler in self._old_handlers.items():
             signal.signal(number, handler)
         self._writer.close()
+        self._thread.join(SECONDS_TO_ANSWER)
 
     def _listen(self) -> None:
         with self._reader:
