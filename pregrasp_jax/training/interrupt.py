@@ -11,7 +11,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 SECONDS_TO_ANSWER = 1.0
-"""How long the end of a loop waits for the answer to a signal: a console that takes nothing is not waited for longer."""
+"""How long the end of a loop waits for the answer to a signal; a console that takes nothing is left then."""
 
 
 class Interrupt:
