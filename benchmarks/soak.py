@@ -79,7 +79,7 @@ def soak(env: Env, num_pushes: int, config: Config) -> dict[str, Any]:
             memory[marks[step]] = memory_bytes()
             print(f"{marks[step]} after {time.perf_counter() - start:.0f} s", file=sys.stderr)
     seconds = time.perf_counter() - start
-    counts = collect.metrics(actors.tally, env.rules.successes)
+    counts = actors.tally.metrics(env.rules.successes)
     reasons = {name.removeprefix("reasons/"): n for name, n in counts.items() if name.startswith("reasons/")}
     return {
         "pushes": counts["env_steps"],

@@ -1,4 +1,4 @@
-"""A bundle of a small random policy, made once per worker; tests copy what they alter."""
+"""A bundle of a small random policy, made once per worker, and what decides by it; tests copy what they alter."""
 
 import functools
 import tempfile
@@ -10,8 +10,11 @@ from drawn_params import drawn_params
 
 from pregrasp_jax.checkpoint import TrainedPolicy, load_policy, save_policy
 from pregrasp_jax.config import Config, NetworkConfig, TaskConfig
+from pregrasp_jax.deploy.build import make_decider
 from pregrasp_jax.deploy.bundle import Bundle, read_bundle
 from pregrasp_jax.deploy.camera import PinholeCamera
+from pregrasp_jax.deploy.cell import Cell
+from pregrasp_jax.deploy.decision import Decider, Push
 from pregrasp_jax.deploy.golden import golden_view
 from pregrasp_jax.deploy.view import View
 from pregrasp_jax.export.bundle import export_policy
@@ -69,3 +72,17 @@ class Small:
 
 
 SMALL = Small()
+
+
+@functools.cache
+def small_decider() -> Decider:
+    """Return what decides by the small bundle in a plain cell."""
+    return make_decider(SMALL.bundle, Cell())
+
+
+def push_to(decider: Decider, row: int = 50, col: int = 4) -> Push:
+    """Return the push of the second choice from the start to a cell of the map."""
+    joints = np.array(decider.contract.robot.home)
+    push, obstruction = decider.plan((row * 100 + col) * 2 + 1, 1.0, decider.start(), joints)
+    assert not obstruction
+    return push

@@ -40,9 +40,12 @@ def key() -> jax.Array:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def optimise_physics(request: pytest.FixtureRequest) -> Generator[None]:
-    """Let the modules that step `mjx` compile as everybody does: hundreds of steps take longer than what is saved."""
-    if not request.path.name.startswith("test_mjx"):
+def optimise(request: pytest.FixtureRequest) -> Generator[None]:
+    """Let some modules compile as everybody does.
+
+    Hundreds of steps of `mjx` take longer than what is saved; and in sensors, two programs have to round alike.
+    """
+    if not request.path.name.startswith(("test_mjx", "test_sensor")):
         yield
         return
     before = jax.config.read("jax_disable_most_optimizations")

@@ -1,18 +1,13 @@
 """The actors in a world without physics: branches, grasps that are tried, resets, counts."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from fake_training import PictureEnv, make_config, make_program
 
 from pregrasp_jax.config import Config
 from pregrasp_jax.settings import to_dict
-from pregrasp_jax.training import collect
-from pregrasp_jax.types import OBSTRUCTIONS, PUSH_REASONS
+from pregrasp_jax.types import PUSH_REASONS
 
 
 def test_branches_are_learned_from_and_change_nothing_else():
@@ -70,7 +65,7 @@ def test_a_grasp_that_is_tried_ends_the_same_episodes_and_pays_only_for_what_hol
             actors, experience = collect_once(actors, state.learning.learner.params, built.pace)
             seen.append((odd, jax.device_get(experience.steps)))
         experiences.append(seen)
-        counts = collect.metrics(actors.tally, built.successes)
+        counts = actors.tally.metrics(built.successes)
         assert (counts["reasons/grasp_failed"] > 0) == try_grasps
     success, dropped = PUSH_REASONS.index("target_in_region"), PUSH_REASONS.index("grasp_failed")
     slips = 0
@@ -82,37 +77,6 @@ def test_a_grasp_that_is_tried_ends_the_same_episodes_and_pays_only_for_what_hol
         np.testing.assert_array_equal(tried.reward, np.where(slipped, 0.0, untried.reward))
         slips += slipped.sum()
     assert slips > 3
-
-
-def test_tally_keeps_the_reasons_of_the_last_episodes():
-    tally = collect.new_tally(4)
-    success, truncated = PUSH_REASONS.index("target_in_region"), PUSH_REASONS.index("truncated")
-    stopped, wall, error = (
-        PUSH_REASONS.index("unreachable"),
-        OBSTRUCTIONS.index("wall"),
-        OBSTRUCTIONS.index("end_error"),
-    )
-    pushes = [([success, 0, truncated], [1, 0, 1]), ([0, success, success], [0, 1, 1]), ([stopped, 0, 0], [1, 0, 0])]
-    for reason, ended in pushes:
-        # A physics failure goes before what stopped the hand: only the reason tells.
-        outcome = SimpleNamespace(obstruction=jnp.array([wall if reason[0] == stopped else 0, 0, error]))
-        results: Any = SimpleNamespace(reason=jnp.array(reason), reward=jnp.ones(3), outcome=outcome)
-        random, overflowed = jnp.array([True, False, False]), jnp.array([reason[0] == success, False, True])
-        diverged = jnp.array([False, False, False, reason[1] == success, True])  # with a branch of two scenes
-        tally = collect._count(tally, results, jnp.array(ended, bool), random, overflowed, diverged)
-    report = collect.metrics(tally, (success,))
-    assert report["train/success_rate"] == 0.5, "the first success has left the window of four"
-    assert (report["episodes"], report["env_steps"]) == (5, 9)
-    assert (report["reasons/target_in_region"], report["reasons/truncated"]) == (3, 1)
-    assert {name: report[f"unreachable/{name}"] for name in OBSTRUCTIONS[1:] if report[f"unreachable/{name}"]} == {
-        "wall": 1
-    }
-    assert report["train/explored"] == pytest.approx(1 / 3) and report["train/episode_length"] == pytest.approx(9 / 5)
-    assert report["physics/overflows"] == 4, "one in the first scene, three in the last"
-    assert report["physics/diverged"] == 4, "one in one branch, three in the last"
-    fresh = collect.metrics(tally.begin_report(), (success,))
-    assert fresh["physics/overflows"] == 0 and fresh["physics/diverged"] == 0
-    assert fresh["train/success_rate"] == 0.5 and fresh["train/reward"] is None and fresh["episodes"] == 5
 
 
 def test_a_scene_that_ended_starts_anew_and_the_others_go_on():

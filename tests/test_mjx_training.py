@@ -29,7 +29,7 @@ from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.spaces.workspace import TABLE
 from pregrasp_jax.task.assembly import assemble
 from pregrasp_jax.task.env import Env
-from pregrasp_jax.training import collect, program
+from pregrasp_jax.training import program
 from pregrasp_jax.training.mishap import NONE
 from pregrasp_jax.types import MAX_OBJECTS, REASONS, SceneParams
 
@@ -119,7 +119,7 @@ def training(built) -> Training:
 @pytest.mark.slow
 def test_two_iterations_push_remember_and_update(training):
     before, after = training.before, training.after
-    report = collect.metrics(after.actors.tally, SUCCESSES)
+    report = after.actors.tally.metrics(SUCCESSES)
     assert report["env_steps"] == 4 and report["physics/overflows"] == 0 and report["reasons/nan"] == 0
     assert int(after.learning.learner.gradient_steps) == 2
     assert np.isfinite(after.learning.metrics["train/loss"])
@@ -138,7 +138,7 @@ def test_a_scene_that_diverges_ends_alone_is_counted_and_starts_anew(training):
     state = training.before.replace(actors=training.before.actors.replace(env_states=broken))
     idle = np.zeros(2, np.int32), np.zeros(2, np.float32), training.pace
     after = training.iterate(jax.tree.map(jnp.copy, state), *idle)
-    report = collect.metrics(after.actors.tally, SUCCESSES)
+    report = after.actors.tally.metrics(SUCCESSES)
     assert report["reasons/nan"] == 1 and report["physics/diverged"] == 1 and report["episodes"] >= 1
     kept, before = after.actors.mishap, state.actors.env_states.physics
     assert (int(kept.scene), int(kept.branch), int(kept.env_steps)) == (0, 0, 2) and bool(kept.seen.diverged)
@@ -174,7 +174,7 @@ def test_twenty_pushes_on_four_packed_scenes_with_automatic_resets(full_env):
     for _ in range(20):
         actors, _ = push(actors, params, built.pace)
         sizes.append(sum(x.nbytes for x in jax.live_arrays()))
-    report = collect.metrics(actors.tally, SUCCESSES)
+    report = actors.tally.metrics(SUCCESSES)
     assert report["env_steps"] == 80 and report["episodes"] > 4
     assert report["reasons/nan"] == 0 and report["physics/overflows"] == 0
     assert np.isfinite(actors.env_states.physics.qpos).all()

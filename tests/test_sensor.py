@@ -121,8 +121,8 @@ def run(given: Sensor, hulls: heightmap.HullInstances, target: jax.Array, push: 
 def test_an_exact_sensor_is_the_pinhole(hulls):
     own = run(Sensor(), hulls, jnp.int32(0), jnp.int32(0))
     pinhole = jax.jit(lambda h: heightmap.pinhole(h, heightmap.overhead_camera()))(hulls)
-    equal = np.isclose(own[0], pinhole[0], rtol=0, atol=1e-5) & (own[1] == pinhole[1])
-    assert equal.mean() >= 0.9999, "two programs: what is rounded otherwise may fall into the next cell"
+    np.testing.assert_allclose(own[0], pinhole[0], atol=1e-5)
+    np.testing.assert_array_equal(own[1], pinhole[1])
 
 
 def test_masks_are_dropped_merged_and_eroded_but_never_the_target_or_the_robot(hulls):

@@ -25,7 +25,7 @@ from pregrasp_jax.config import ExplorationConfig
 from pregrasp_jax.learning import learner
 from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.task.primitive import Plan
-from pregrasp_jax.training import collect, learn
+from pregrasp_jax.training import learn
 from pregrasp_jax.training.run_folder import RunFolder, stored_config
 from pregrasp_jax.training.trainer import Trainer
 from pregrasp_jax.types import PUSH_REASONS, EnvState, StepResult
@@ -241,7 +241,7 @@ def test_a_push_is_traced_once_for_shapes_start_and_compilation_and_its_overflow
     actors, _ = compiled.collect(state.actors, params, built.pace)
     actors, _ = compiled.collect(actors, params, built.pace)
     assert len(env.traces) == 1
-    assert collect.metrics(actors.tally, built.successes)["physics/overflows"] == 2 * config.train.num_envs
+    assert actors.tally.metrics(built.successes)["physics/overflows"] == 2 * config.train.num_envs
 
 
 def test_a_run_of_fused_iterations_measures_what_the_loop_does(tmp_path, finished):

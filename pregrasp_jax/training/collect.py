@@ -5,7 +5,6 @@ physics of the next push may run while the learner still digests the last one.
 """
 
 import functools
-from collections.abc import Sequence
 from typing import Any, Protocol
 
 import flax.struct as struct
@@ -25,10 +24,8 @@ from pregrasp_jax.task.stages import Stages, make_stages
 from pregrasp_jax.training.mishap import Mishap, no_mishap
 from pregrasp_jax.training.schedules import Pace
 from pregrasp_jax.training.sharding import VmapFn
-from pregrasp_jax.types import OBSTRUCTIONS, PUSH_REASONS, EnvState, HandPose, StepResult
-
-RECENT_EPISODES = 200
-"""Episodes behind `train/success_rate`, or one per scene where there are more scenes."""
+from pregrasp_jax.training.tally import Tally, new_tally
+from pregrasp_jax.types import EnvState, HandPose, StepResult
 
 
 class Environment(Protocol):
@@ -78,62 +75,6 @@ class Environment(Protocol):
         ...
 
 
-class Tally(struct.PyTreeNode):
-    """What happened, counted on the device, so that the loop need not wait for numbers it only prints.
-
-    Attributes:
-        env_steps: () int32 pushes ever.
-        episodes: () int32 ended ever.
-        recent: [W] int8 reasons of the last W episodes, a ring; -1 where there was none yet.
-        pushes: () int32 since the last report.
-        reward: () float32 summed over them.
-        explored: () int32 of them were random.
-        overflowed: () int32 pushes since the last report, branches included, in which the engine dropped contacts.
-        diverged: () int32 pushes since the last report, branches included, after which the physics made no sense.
-        reasons: [len(PUSH_REASONS)] int32 why episodes ended since the last report.
-        obstructions: [len(OBSTRUCTIONS)] int32 what made the last push of those unreachable that ended so.
-    """
-
-    env_steps: jax.Array
-    episodes: jax.Array
-    recent: jax.Array
-    pushes: jax.Array
-    reward: jax.Array
-    explored: jax.Array
-    overflowed: jax.Array
-    diverged: jax.Array
-    reasons: jax.Array
-    obstructions: jax.Array
-
-    def begin_report(self) -> "Tally":
-        """Return the tally with the counts since the last report at 0."""
-        return self.replace(
-            pushes=jnp.zeros_like(self.pushes),
-            reward=jnp.zeros_like(self.reward),
-            explored=jnp.zeros_like(self.explored),
-            overflowed=jnp.zeros_like(self.overflowed),
-            diverged=jnp.zeros_like(self.diverged),
-            reasons=jnp.zeros_like(self.reasons),
-            obstructions=jnp.zeros_like(self.obstructions),
-        )
-
-
-def new_tally(window: int) -> Tally:
-    """Return the tally of a run that begins, which remembers `window` episodes."""
-    return Tally(
-        env_steps=jnp.int32(0),
-        episodes=jnp.int32(0),
-        recent=jnp.full(window, -1, jnp.int8),
-        pushes=jnp.int32(0),
-        reward=jnp.float32(0),
-        explored=jnp.int32(0),
-        overflowed=jnp.int32(0),
-        diverged=jnp.int32(0),
-        reasons=jnp.zeros(len(PUSH_REASONS), jnp.int32),
-        obstructions=jnp.zeros(len(OBSTRUCTIONS), jnp.int32),
-    )
-
-
 class Actors(struct.PyTreeNode):
     """State of the actors.
 
@@ -172,7 +113,7 @@ def init_actors(key: jax.Array, env: Environment, num_envs: int, *, vmap: VmapFn
     """Return `num_envs` scenes at the start of an episode; `vmap` is as in `make_collect`."""
     key, reset_key = jax.random.split(key)
     states = vmap(env.reset)(jax.random.split(reset_key, num_envs))
-    return Actors(states, key, new_tally(max(RECENT_EPISODES, num_envs)), no_mishap(states))
+    return Actors(states, key, new_tally(num_envs), no_mishap(states))
 
 
 def make_collect(
@@ -271,7 +212,7 @@ def make_collect(
         ended = results.terminated | results.truncated
         overflowed = ends.physics_obs.overflows > starts.physics_obs.overflows
         diverged = steps.outcome.diverged
-        tally = _count(actors.tally, results, ended, random, overflowed, diverged)
+        tally = actors.tally.count(results, ended, random, overflowed, diverged)
         mishap = actors.mishap.note(states, actions, ends, diverged, tally.env_steps)
         fresh = vmap(env.reset)(jax.random.split(reset_key, num_envs))
         actors = Actors(_select(ended, fresh, next_states), actors.key, tally, mishap)
@@ -319,59 +260,3 @@ def _steps(root: jax.Array, states: EnvState, actions: jax.Array, results: StepR
 def _select(ended: jax.Array, fresh: Any, going_on: Any) -> Any:
     """Return `fresh` where `ended` [E], for every leaf [E, ...]."""
     return jax.vmap(lambda e, a, b: jax.tree.map(lambda x, y: jnp.where(e, x, y), a, b))(ended, fresh, going_on)
-
-
-def _count(
-    tally: Tally,
-    results: StepResult,
-    ended: jax.Array,
-    random: jax.Array,
-    overflowed: jax.Array,
-    diverged: jax.Array,
-) -> Tally:
-    window = tally.recent.shape[0]
-    order = jnp.cumsum(ended, dtype=jnp.int32) - 1
-    unreachable = ended & (results.reason == PUSH_REASONS.index("unreachable"))
-    slots = jnp.where(ended, (tally.episodes + order) % window, window)
-    return Tally(
-        env_steps=tally.env_steps + ended.shape[0],
-        episodes=tally.episodes + jnp.sum(ended, dtype=jnp.int32),
-        recent=tally.recent.at[slots].set(results.reason.astype(jnp.int8), mode="drop"),
-        pushes=tally.pushes + ended.shape[0],
-        reward=tally.reward + jnp.sum(results.reward),
-        explored=tally.explored + jnp.sum(random, dtype=jnp.int32),
-        overflowed=tally.overflowed + jnp.sum(overflowed, dtype=jnp.int32),
-        diverged=tally.diverged + jnp.sum(diverged, dtype=jnp.int32),
-        reasons=tally.reasons.at[results.reason].add(ended.astype(jnp.int32)),
-        obstructions=tally.obstructions.at[results.outcome.obstruction].add(unreachable.astype(jnp.int32)),
-    )
-
-
-def metrics(tally: Tally, successes: Sequence[int]) -> dict[str, Any]:
-    """Return the row of metrics () of a tally, on the host; shares without a case are None.
-
-    Args:
-        tally: the counts.
-        successes: reasons that count as success.
-    """
-    counts = jax.device_get(tally)
-    recent = counts.recent[counts.recent >= 0]
-    episodes = int(counts.reasons.sum())
-    return {
-        "env_steps": int(counts.env_steps),
-        "episodes": int(counts.episodes),
-        "train/success_rate": float(np.isin(recent, successes).mean()) if len(recent) else None,
-        "train/reward": float(counts.reward / counts.pushes) if counts.pushes else None,
-        "train/episode_length": float(counts.pushes / episodes) if episodes else None,
-        "train/explored": float(counts.explored / counts.pushes) if counts.pushes else None,
-        "physics/overflows": int(counts.overflowed),
-        "physics/diverged": int(counts.diverged),
-        **{
-            f"reasons/{name}": int(n) for name, n in zip(PUSH_REASONS, counts.reasons, strict=True) if name != "running"
-        },
-        **{
-            f"unreachable/{name}": int(n)
-            for name, n in zip(OBSTRUCTIONS, counts.obstructions, strict=True)
-            if name != "none"
-        },
-    }

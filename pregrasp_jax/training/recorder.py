@@ -121,7 +121,7 @@ class Recorder:
             FloatingPointError: the loss is no longer finite; all checkpoints are.
         """
         counters = self.counters
-        row = collect.metrics(state.actors.tally, self._successes) | learn.metrics(state.learning)
+        row = state.actors.tally.metrics(self._successes) | learn.metrics(state.learning)
         epsilon = collect.epsilon_at(
             counters.env_steps,
             self.config.exploration,
