@@ -34,10 +34,23 @@ jax.config.update(
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
-LONGEST = (
-    "test_examples test_mjx test_mjx_contacts test_assets_meshes test_dump test_replay test_training test_disk "
-    "test_gymnasium test_confined test_networks test_probe_envs test_cli test_heightmap_observation test_env"
-).split()
+LONGEST = [
+    "test_examples",
+    "test_mjx",
+    "test_mjx_contacts",
+    "test_assets_meshes",
+    "test_dump",
+    "test_replay",
+    "test_training",
+    "test_disk",
+    "test_gymnasium",
+    "test_confined",
+    "test_networks",
+    "test_probe_envs",
+    "test_cli",
+    "test_heightmap_observation",
+    "test_env",
+]
 """Modules to begin with, the longest first, so that no worker ends the run alone with one of them."""
 
 
