@@ -10,6 +10,7 @@ import pregrasp_jax  # noqa: F401  (before jax, which reads then how many thread
 
 # isort: split
 import dataclasses
+import functools
 import math
 from pathlib import Path
 
@@ -45,7 +46,8 @@ def make_place(config: Config, name: str) -> Env:
 def draw(env: Env, path: Path) -> None:
     """Write a view of the first scene."""
     state = jax.jit(env.reset_to)(jnp.int32(0))
-    view = drawing.draw_camera(env_hulls(env, state), target_slot=int(state.scene.target))
+    hulls = jax.jit(functools.partial(env_hulls, env))(state)
+    view = drawing.draw_camera(hulls, target_slot=int(state.scene.target))
     drawing.save_image(path, view)
 
 

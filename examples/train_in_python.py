@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -78,7 +77,7 @@ def main(
     print(f"one random push each: {', '.join(step(env, config.train.num_envs))}")
 
     trained = train(env, config, updates=updates)
-    moved = jax.tree.map(lambda a, b: float(jnp.max(jnp.abs(a - b))), trained.first, trained.last)
+    moved = jax.tree.map(lambda a, b: float(np.max(np.abs(a - b))), trained.first, trained.last)
     print(f"{trained.updates} updates moved a parameter by up to {max(jax.tree.leaves(moved)):.2g}")
 
     save_policy(folder, trained.last, config, evaluation={})

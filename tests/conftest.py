@@ -69,9 +69,10 @@ def key() -> jax.Array:
 def optimise(request: pytest.FixtureRequest) -> Generator[None]:
     """Let some modules compile as everybody does.
 
-    Hundreds of steps of `mjx` take longer than what is saved; and in sensors, two programs have to round alike.
+    Hundreds of steps of `mjx`, or millions of draws, take longer than what is saved; and in sensors, two programs have
+    to round alike.
     """
-    if not request.path.name.startswith(("test_mjx", "test_sensor")):
+    if not request.path.name.startswith(("test_mjx", "test_exploration", "test_sensor")):
         yield
         return
     before = jax.config.read("jax_disable_most_optimizations")

@@ -135,7 +135,8 @@ def fill(world: World, memory: replay.Replay, steps: int, relabel: bool = True) 
 
 
 def empty(capacity: int = 37) -> replay.Replay:
-    return replay.init(World(0).step(), capacity=capacity, max_pushes=MAX_PUSHES)
+    init = functools.partial(replay.init, capacity=capacity, max_pushes=MAX_PUSHES)
+    return jax.jit(init)(World(0).step())
 
 
 def alive_rows(memory: replay.Replay) -> list[tuple]:

@@ -113,7 +113,7 @@ def test_random_actions_cover_the_whole_map_or_what_the_network_values_of_it():
     everywhere, keys = jnp.ones(ACTIONS.shape, bool), jax.random.split(jax.random.key(1), 20_000)
     draw = jax.jit(lambda keys, mask: draw_many(lambda key: exploration.random_action(key, mask, ACTIONS), keys))
     few = everywhere.at[:, :98].set(False)
-    assert set(np.asarray(draw(keys, few)) % 200) == {196, 197, 198, 199}
+    assert set(np.asarray(draw(keys[:1000], few)) % 200) == {196, 197, 198, 199}
     actions = np.asarray(draw(keys, everywhere))
     assert actions.min() < 20 and actions.max() >= NUM_ACTIONS - 20
     counts, _ = np.histogram(actions, bins=20, range=(0, NUM_ACTIONS))

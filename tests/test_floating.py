@@ -85,7 +85,7 @@ def test_its_links_are_where_mujoco_has_them(robot):
     data.qpos[robot.joint_qpos_ids(mj_model)] = joint_pos
     data.joint("hand_right").qpos[0] = -joint_pos[4]
     mujoco.mj_kinematics(mj_model, data)
-    poses = robot.links.poses(jnp.asarray(joint_pos))
+    poses = jax.jit(robot.links.poses)(jnp.asarray(joint_pos))
     found = np.array([data.body(name).xpos for name in robot.links.names])
     np.testing.assert_allclose(poses[:, :3], found, atol=1e-6)
 
@@ -114,7 +114,7 @@ def test_it_follows_a_turning_path_within_a_millimetre(robot):
 
 def test_a_hand_that_has_turned_around_does_not_unwind(robot):
     joint_pos = jnp.asarray(robot.home).at[3].set(0.3 + 2 * np.pi)
-    ctrl, _ = robot.follow(joint_pos, path(20, yaw=0.3), jnp.full(20, 0.4), TABLE)
+    ctrl, _ = jax.jit(robot.follow, static_argnums=3)(joint_pos, path(20, yaw=0.3), jnp.full(20, 0.4), TABLE)
     np.testing.assert_allclose(ctrl[:, 3], 0.3 + 2 * np.pi, atol=1e-4)
 
 
@@ -124,7 +124,9 @@ def test_a_hand_that_has_turned_around_does_not_unwind(robot):
 )
 def test_the_code_of_a_row_says_what_is_in_the_way(robot, end, reason):
     walled = Workspace(name="walled", walls=(Box(center=(0.0, 0.27, 0.1), half_size=(0.25, 0.02, 0.1)),))
-    _, code = robot.follow(jnp.asarray(robot.home), path(30, **end), jnp.full(30, 0.4), walled)
+    _, code = jax.jit(robot.follow, static_argnums=3)(
+        jnp.asarray(robot.home), path(30, **end), jnp.full(30, 0.4), walled
+    )
     assert OBSTRUCTIONS[int(code[-1])] == reason and code[0] == 0
 
 
@@ -132,8 +134,9 @@ def test_only_walls_are_kept_clear_of(robot):
     low = jnp.asarray(robot.home).at[2].set(0.021)
     assert robot.clearance(low, TABLE) == jnp.inf
     wall = Box(center=(-0.30, 0.20, 0.1), half_size=(0.3, 0.02, 0.1))
-    distance = float(robot.clearance(jnp.asarray(robot.home).at[3].set(0.0), Workspace(name="w", walls=(wall,))))
-    assert distance == pytest.approx(0.18 - (0.05 + 0.03 + 0.08 * np.sin(0.4) + 0.006 * np.cos(0.4)), abs=1e-4)
+    walled = Workspace(name="w", walls=(wall,))
+    distance = jax.jit(lambda joints: robot.clearance(joints, walled))(jnp.asarray(robot.home).at[3].set(0.0))
+    assert float(distance) == pytest.approx(0.18 - (0.05 + 0.03 + 0.08 * np.sin(0.4) + 0.006 * np.cos(0.4)), abs=1e-4)
 
 
 def test_the_first_name_that_holds_is_the_reason():

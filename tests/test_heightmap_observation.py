@@ -40,7 +40,8 @@ def joints() -> jax.Array:
     """An open hand in the middle of the workspace, 5 cm off the axis; one finger is less open than the other."""
     hand_pose = jnp.array([0.05, -0.05, 0.1, 1.0, 0.0, 0.0, 0.0])
     still, fingers = jnp.stack([hand_pose] * 2), jnp.full(2, FINGER_OPEN)
-    controls, _ = ROBOT.follow(jnp.asarray(ROBOT.home), still, fingers, TABLE)
+    follow = jax.jit(ROBOT.follow, static_argnums=3)
+    controls, _ = follow(jnp.asarray(ROBOT.home), still, fingers, TABLE)
     return jnp.append(controls[0, :6], jnp.array([FINGER_OPEN, 0.6 * FINGER_OPEN]))
 
 
@@ -164,7 +165,7 @@ def test_overhead_camera_is_the_one_of_the_mjcf():
     np.testing.assert_allclose(camera.rotation, np.eye(3), atol=1e-6)
     # A point is where MuJoCo's own camera frame puts it: +x right, +y up, row 0 on top.
     point = make_instances([box_cloud((0.10, 0.15, 0), (0.102, 0.152, 0.001))], [1])
-    _, labels = heightmap.render_pinhole(point, camera)
+    _, labels = jax.jit(heightmap.render_pinhole)(point, camera)
     rows, columns = np.nonzero(labels)
     focal = 240 / np.tan(np.deg2rad(table_model().camera("overhead").fovy.item()) / 2)
     np.testing.assert_allclose(columns.mean() + 0.5, 320 + focal * 0.101, atol=0.5)
@@ -203,8 +204,8 @@ def test_walls_are_as_high_as_they_are_and_belong_to_the_table(bank, joints, key
         ),
     )
     scene, physics_obs = make_scene(key, [-1] * MAX_OBJECTS, joints)
-    walled = heightmap.scene_hulls(bank, ROBOT, scene, physics_obs, workspace)
-    plain = heightmap.scene_hulls(bank, ROBOT, scene, physics_obs)
+    hulls_of = jax.jit(functools.partial(heightmap.scene_hulls, bank, ROBOT), static_argnums=2)
+    walled, plain = hulls_of(scene, physics_obs, workspace), hulls_of(scene, physics_obs)
     assert walled.present.shape[0] == plain.present.shape[0] + 2
     height, ids = heightmap.orthographic(walled)
     bare_height, bare_ids = heightmap.orthographic(plain)

@@ -1,5 +1,7 @@
 """PPG's networks and losses: counted, compared with formulas in numpy, and right under turns."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -74,7 +76,7 @@ def test_it_computes_what_its_formula_says():
     network = StrokeNetwork(width=1 / 32)
     image = np.random.default_rng(1).normal(size=(16, 16)).astype(np.float32)
     params = random_like(jax.eval_shape(network.init, jax.random.key(0), jnp.zeros((1, 16, 16)))["params"])
-    found = np.asarray(network.apply({"params": params}, jnp.asarray(image)[None]))[0]
+    found = np.asarray(jax.jit(network.apply)({"params": params}, jnp.asarray(image)[None]))[0]
     p = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params)
     x = np.maximum(convolve(image[..., None].astype(float), p["stem"]["kernel"]), 0)
     x = block_by_hand(pool_by_hand(x), p["block1"])
@@ -89,8 +91,9 @@ def test_it_computes_what_its_formula_says():
 def test_running_moments_follow_the_batch():
     network = StrokeNetwork(width=1 / 32)
     x = jax.random.normal(jax.random.key(1), (2, 16, 16))
-    params = network.init(jax.random.key(0), x)["params"]
-    _, sown = network.apply({"params": params}, x, train=True, mutable=["moments"])
+    params = jax.jit(network.init)(jax.random.key(0), x)["params"]
+    apply = jax.jit(functools.partial(network.apply, train=True, mutable=["moments"]))
+    _, sown = apply({"params": params}, x)
     moved = networks.with_moments(params, sown["moments"])
     hidden = jax.nn.relu(jnp.asarray(networks.Convolution(2, 3).apply({"params": params["stem"]}, x[..., None])))
     stem = networks._max_pool(hidden)
@@ -103,7 +106,7 @@ def test_running_moments_follow_the_batch():
 
 
 def test_the_loss_is_the_cross_entropy_over_the_map_that_was_turned_back():
-    logits = np.random.default_rng(2).normal(size=(SIZE, SIZE)).astype(np.float32)
+    logits, loss = np.random.default_rng(2).normal(size=(SIZE, SIZE)).astype(np.float32), jax.jit(start_loss)
     for heading, row, col in ((0, 10, 20), (3, 50, 99), (12, 0, 0)):
         table, inside = (array[heading] for array in turning_back(HEADINGS))
         back = np.where(inside, logits.ravel()[table], 0.0).astype(np.float64)
@@ -112,7 +115,7 @@ def test_the_loss_is_the_cross_entropy_over_the_map_that_was_turned_back():
         label[row + PAD, col + PAD] = 1
         label = label.ravel()
         expected = -(label * np.log(p) + (1 - label) * np.log(1 - p)).sum()
-        found = float(start_loss(jnp.asarray(logits), *(jnp.int32(i) for i in (row, col, heading))))
+        found = float(loss(jnp.asarray(logits), *(jnp.int32(i) for i in (row, col, heading))))
         assert found == pytest.approx(expected, rel=1e-5)
 
 
@@ -120,7 +123,7 @@ def test_a_scene_turned_by_a_right_angle_has_its_maps_four_headings_on():
     function = StrokeFunction(StrokesConfig(width=1 / 32), ACTIONS)
     height = jax.random.uniform(jax.random.key(3), (100, 100), maxval=0.2)
     values = jax.jit(function.values)
-    params = function.init(jax.random.key(0))
+    params = jax.jit(function.init)(jax.random.key(0))
     # A right angle from x to y: row r and column c go to row c and column -r.
     found, turned = np.asarray(values(params, height)), np.asarray(values(params, height[::-1].T))
     expected = np.roll(np.swapaxes(found[::-1], 0, 1), 4, axis=-1)
@@ -152,7 +155,7 @@ def test_a_demonstration_that_is_turned_still_looks_at_the_same_thing(seed, turn
 def test_all_quarter_turns_and_reflections_occur():
     height = jnp.zeros((100, 100)).at[10, 30].set(0.1)
     shown = Demonstration(height, jnp.int32(10), jnp.int32(30), jnp.int32(1), jnp.float32(0.5))
-    found = jax.vmap(turned_at_random, (0, None))(jax.random.split(jax.random.key(0), 64), shown)
+    found = jax.jit(jax.vmap(turned_at_random, (0, None)))(jax.random.split(jax.random.key(0), 64), shown)
     assert set(np.asarray(found.heading).tolist()) == {1, 5, 9, 13, 15, 11, 7, 3}, "+1 turned, -1 reflected and turned"
     assert (np.asarray(found.height)[np.arange(64), found.row, found.col] > 0).all()
 

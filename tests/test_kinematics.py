@@ -142,7 +142,7 @@ def test_a_path_keeps_the_branch_that_is_nearest_to_the_current_joints():
     """From every posture of the start pose a short path is followed without a jump, in that posture."""
     start = np.array([-0.3, 0.0, 0.1, 1, 0, 0, 0], np.float32)
     path = jnp.asarray(start + np.linspace(0, 0.02, 10)[:, None] * np.eye(7, dtype=np.float32)[0])
-    postures = np.asarray(kinematics.hand_inverse_kinematics(ARM, jnp.asarray(start)))
+    postures = np.asarray(jax.jit(partial(kinematics.hand_inverse_kinematics, ARM))(jnp.asarray(start)))
     follow = jax.jit(lambda joints: ROBOT.follow(joints, path, jnp.zeros(10), TABLE)[0])
     followed = 0
     for posture in postures[np.isfinite(postures).all(axis=1)]:

@@ -1,3 +1,4 @@
+import functools
 from types import SimpleNamespace
 from typing import Any
 
@@ -145,7 +146,7 @@ def run_update(params, batch, optimizer=None, **options):
     optimizer = optimizer or optax.sgd(1.0)
     state = learner.init(params, optimizer)
     options = OPTIONS | {"q": table(), "mask_fn": first_row, "optimizer": optimizer} | options
-    return learner.update(state, batch, **options)
+    return jax.jit(functools.partial(learner.update, **options))(state, batch)
 
 
 @pytest.mark.parametrize("compiled", [False, True])
@@ -216,7 +217,7 @@ def test_targets_come_from_the_target_network():
     optimizer = optax.sgd(0.0)
     state = learner.init(jnp.zeros((1, H, W, 2)), optimizer).replace(target_params=Q[None])
     options = OPTIONS | {"q": table(), "mask_fn": first_row, "optimizer": optimizer}
-    _, errors, _, _ = learner.update(state, make_batch([0], [0]), **options)
+    _, errors, _, _ = jax.jit(functools.partial(learner.update, **options))(state, make_batch([0], [0]))
     assert float(errors[0, 0]) == -4.5
 
 

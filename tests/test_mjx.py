@@ -41,7 +41,8 @@ def oracle(bank):
 
 @pytest.fixture(scope="module")
 def engine(bank):
-    return mjx.make_engine(bank, ROBOT, TABLE, num_slots=NUM_SLOTS, num_hulls=MAX_HULLS)
+    made = mjx.make_engine(bank, ROBOT, TABLE, num_slots=NUM_SLOTS, num_hulls=MAX_HULLS)
+    return dataclasses.replace(made, init=jax.jit(made.init), reset=jax.jit(made.reset), observe=jax.jit(made.observe))
 
 
 def row_of(bank, object_ids) -> SceneParams:
@@ -66,7 +67,8 @@ def plans():
     rows = num_push_rows(0.1, 0.1)
     strokes = [Stroke(start, start.replace(xy=jnp.array(end), aperture=jnp.float32(FINGER_CLOSED))) for end in ends]
     home = jnp.asarray(ROBOT.home)
-    return [plan_push(ROBOT, TABLE, home, stroke, push_speed=0.1, num_rows=rows) for stroke in strokes]
+    plan = jax.jit(lambda stroke: plan_push(ROBOT, TABLE, home, stroke, push_speed=0.1, num_rows=rows))
+    return [plan(stroke) for stroke in strokes]
 
 
 @pytest.mark.slow
@@ -113,7 +115,7 @@ def test_a_push_moves_objects_as_c_does(bank, oracle, engine, plans, pushed):
     not rounding; other contacts, where C stops short of the least translation, are the suspect but not isolated.
     """
     *_, after = pushed
-    seen = jax.vmap(engine.observe)(after)
+    seen = jax.jit(jax.vmap(engine.observe))(after)
     for i, object_ids in enumerate(SCENES):
         count = sum(o >= 0 for o in object_ids)
         poses = np.asarray(row_of(bank, object_ids).poses, np.float64)

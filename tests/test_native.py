@@ -29,7 +29,8 @@ NUM_ROWS = num_push_rows(0.15, 0.1)
 
 @pytest.fixture(scope="module")
 def engine() -> Engine:
-    return make_engine("native", builtin_bank("seen"), ROBOT, TABLE)
+    made = make_engine("native", builtin_bank("seen"), ROBOT, TABLE)
+    return dataclasses.replace(made, init=jax.jit(made.init), reset=jax.jit(made.reset), observe=jax.jit(made.observe))
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """`pregrasp-jax replay-dump`: repeat a push on which the physics of a training diverged."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -137,8 +138,9 @@ def describe_replay(env: Env, dump: Dump, mishap: Mishap, replay: RepeatedPush) 
 def draw_replay(env: Env, mishap: Mishap, replay: RepeatedPush) -> np.ndarray:
     """Return scene | height | segmentation | push before, and the scene afterwards if it is finite."""
     target, before = int(mishap.state.scene.target), replay.before
+    hulls_of = jax.jit(functools.partial(env_hulls, env))
     tiles = drawing.make_tiles(
-        env_hulls(env, before),
+        hulls_of(before),
         before.obs,
         target,
         actions=env.primitive.actions,
@@ -147,7 +149,7 @@ def draw_replay(env: Env, mishap: Mishap, replay: RepeatedPush) -> np.ndarray:
     )
     seen = replay.after.physics_obs
     if all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(seen)):
-        hulls = env_hulls(env, replay.after)
+        hulls = hulls_of(replay.after)
         view = drawing.draw_camera(hulls, target_slot=target, camera=drawing.side_view(tiles[0][1].shape[:2]))
         tiles.append(("scene afterwards", view))
     return drawing.make_panel(tiles, title=f"step {int(mishap.env_steps)} | {REASONS[int(replay.result.reason)]}")
@@ -158,11 +160,11 @@ def _watch(env: Env, run: Callable[..., Any], physics: Any, plan: Plan, num_ctrl
 
     The `native` engine wakes what sleeps whenever it is called, so the last digits are not those of the whole push.
     """
-    rows, speeds = np.arange(len(plan.ctrl)), []
+    rows, speeds, observe = np.arange(len(plan.ctrl)), [], jax.jit(env.engine.observe)
     for row in range(num_ctrl):
         physics = run(physics, plan.ctrl[np.minimum(row + rows, rows[-1])], jnp.int32(1))
         speeds.append(np.abs(env.engine.coordinates(physics)[1]).max())
-        if env.engine.observe(physics).diverged:
+        if observe(physics).diverged:
             break
     return np.array(speeds)
 

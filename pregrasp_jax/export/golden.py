@@ -4,6 +4,7 @@ Packed scenes of built-in objects with the hand at the start or anywhere in reac
 Depth is stored in steps of 0.1 mm, masks as an image of instance ids.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -65,16 +66,20 @@ def make_views(robot: Robot, workspace: Workspace, primitive: Primitive, *, coun
     rng = np.random.default_rng(0)
     allowed = np.flatnonzero(np.asarray(primitive.mask(start)).any(axis=-1))
     see = jax.jit(lambda scene, seen: _see(bank, robot, workspace, scene, seen))
+    stand = jax.jit(functools.partial(_stand_at, robot, workspace))
+    pose_of = jax.jit(robot.hand_pose)
     views = []
     for index in range(count):
         hand, joints = start, robot.home
         if index >= (count + 1) // 2:
             row, col = divmod(int(rng.choice(allowed)), grid.GRID_SIZE)
             moved = start.replace(xy=jnp.asarray(grid.cell_to_world(np.int32(row), np.int32(col)), jnp.float32))
-            joints, hand = _joints_at(robot, workspace, moved), moved
+            hand, joints = moved, np.array(robot.home)
+            driven = min(len(robot.actuators), len(joints))
+            joints[:driven] = np.asarray(stand(moved))[:driven]
         scene = SceneParams(*(jnp.asarray(x[index]) for x in (scenes.object_ids, scenes.poses, scenes.target)))
         nothing = {"diverged": jnp.bool_(False), "overflows": jnp.int32(0)}
-        pose = robot.hand_pose(jnp.asarray(joints))
+        pose = pose_of(jnp.asarray(joints))
         seen = PhysicsObservation(scene.poses, jnp.asarray(joints), pose, **nothing)
         depth, instances, height, ids = jax.device_get(see(scene, seen))
         target, sent = int(scenes.target[index]), jax.device_get(hand)
@@ -126,12 +131,9 @@ def _see(bank: Any, robot: Robot, workspace: Workspace, scene: SceneParams, seen
     return steps.astype(jnp.uint16), jnp.where(exact, 0, labels).astype(jnp.uint8), height, ids
 
 
-def _joints_at(robot: Robot, workspace: Workspace, hand: HandPose) -> np.ndarray:
-    """Return joint positions [J] with the hand at a pose, fingers as at the start."""
+def _stand_at(robot: Robot, workspace: Workspace, hand: HandPose) -> jax.Array:
+    """Return the controls [A] that hold the hand at a pose."""
     pose = jnp.array([*hand.xy, hand.z, jnp.cos(hand.yaw / 2), 0.0, 0.0, jnp.sin(hand.yaw / 2)])
     still = jnp.tile(pose[None], (_ROWS, 1))
     controls, _ = robot.follow(jnp.asarray(robot.home), still, jnp.full(_ROWS, hand.aperture), workspace)
-    joints = np.array(robot.home)
-    moved = min(len(robot.actuators), len(joints))
-    joints[:moved] = np.asarray(controls[0])[:moved]
-    return joints
+    return controls[0]

@@ -48,11 +48,11 @@ def draw_decision(player: Player, *, scene: int, pushes: int, seed: int = 0) -> 
 
 def draw_scenes(env: Env, indices: Iterable[int]) -> np.ndarray:
     """Return views of scenes side by side, each with its number and target."""
-    reset = jax.jit(env.reset_to)
+    reset, hulls_of = jax.jit(env.reset_to), jax.jit(functools.partial(env_hulls, env))
     tiles = []
     for index in indices:
         state = reset(jnp.int32(index))
-        hulls = env_hulls(env, state)
+        hulls = hulls_of(state)
         view = drawing.draw_camera(hulls, target_slot=int(state.scene.target), camera=drawing.side_view(_TILE))
         picture = Image.fromarray(view)
         ImageDraw.Draw(picture).text((6, 4), f"{index}: {_target_name(env, state)}", fill=(30, 30, 30))

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections import Counter
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -31,20 +32,29 @@ def refuse_walls(robot: Robot, workspace: Workspace) -> None:
     Raises:
         ValueError: one line says which wall, and what is allowed.
     """
-    for index, wall in enumerate(workspace.walls):
-        alone = dataclasses.replace(workspace, walls=(wall,))
+    if not workspace.walls:
+        return
+    clear_of = np.asarray(_clearances(robot, workspace)(jnp.asarray(robot.homes)))
+    for index, (wall, clear) in enumerate(zip(workspace.walls, clear_of, strict=True)):
         reach = wall.distance_to_origin()
         if reach < MAX_RADIUS:
             raise ValueError(
                 f"workspace '{workspace.name}': wall {index} comes within {reach:.3f} m of the centre, where scenes "
                 f"are packed; allowed is {MAX_RADIUS} m or more"
             )
-        clear = min(float(robot.clearance(jnp.asarray(home), alone)) for home in robot.homes)
         if clear < CLEARANCE_MARGIN:
             raise ValueError(
                 f"workspace '{workspace.name}': wall {index} is {clear:.3f} m from robot {robot.name} at its start "
                 f"pose; allowed is {CLEARANCE_MARGIN} m or more"
             )
+
+
+def _clearances(robot: Robot, workspace: Workspace) -> Callable[[jax.Array], jax.Array]:
+    """Return a function from joint positions [N, J] to the least clearance of each wall [W], m."""
+    places = [dataclasses.replace(workspace, walls=(wall,)) for wall in workspace.walls]
+    return jax.jit(
+        lambda homes: jnp.stack([jnp.min(jax.vmap(lambda q, p=p: robot.clearance(q, p))(homes)) for p in places])
+    )
 
 
 def refuse_scenes(workspace: Workspace, scenes: SceneBank) -> None:
@@ -71,7 +81,7 @@ def refuse_blocked(robot: Robot, workspace: Workspace, primitive: Primitive) -> 
     if not workspace.walls:
         return
     start = jax.tree.map(jnp.asarray, robot.start)
-    allowed = np.flatnonzero(primitive.mask(start))
+    allowed = np.flatnonzero(jax.jit(primitive.mask)(start))
     tried = jnp.asarray(allowed[:: -(-len(allowed) // _TRIED_ACTIONS)], jnp.int32)
 
     @jax.jit

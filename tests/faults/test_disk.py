@@ -229,9 +229,10 @@ def test_a_policy_that_could_not_be_written_is_not_the_best(tmp_path):
     with pretended_disk(tmp_path / "disk") as full:
         trainer = make_trainer(path, CONFIG, said=said)
         trainer.recorder.evaluate_fn = lambda params: {"success_rate": next(scores)}
+        program = trainer.program.compile(trainer.state)
         for disk in (nullcontext(), full(), nullcontext()):
             with disk:
-                trainer.step(trainer.program)
+                trainer.step(program)
                 trainer.recorder.evaluate(trainer.average())
     assert [line.split(": ")[1] for line in said.getvalue().splitlines() if line.startswith("validation")] == [
         "success 30% (best 30%)",
