@@ -1,6 +1,7 @@
 """Trainings in the world without physics, with a network that compiles in no time."""
 
 import dataclasses
+import functools
 import io
 import json
 from collections.abc import Callable
@@ -81,6 +82,25 @@ def make_program(config: Config, env: Any = None, **options: Any) -> program.Pro
     return program.make_program(scenes, config, q_function=q_function, **options)
 
 
+class CompiledOnce(program.Program):
+    """A program that remembers what it was compiled to: many tests train by the same settings."""
+
+    @functools.cached_property
+    def compiled(self) -> list[program.Program]:
+        return []
+
+    def compile(self, state: program.TrainState) -> program.Program:
+        if not self.compiled:
+            self.compiled.append(super().compile(state))
+        return self.compiled[0]
+
+
+@functools.lru_cache(maxsize=4)
+def shared_program(config: Config) -> program.Program:
+    """Return the program of the world without physics for a configuration, the same every time."""
+    return CompiledOnce(**vars(make_program(config)))
+
+
 def evaluate(params: Any) -> dict[str, Any]:
     return {"success_rate": 0.25, "mean_motions": None}
 
@@ -104,8 +124,8 @@ def make_trainer(
     env: Any = None,
     folder: RunFolder | None = None,
 ) -> Trainer:
+    built = make_program(config, env) if env else shared_program(config)
     env = env or PictureEnv()
-    built = make_program(config, env)
     folder = folder or (RunFolder.open(path, config) if resume else RunFolder.create(path, config))
     dump, console = make_dump(env, config), Console(said or io.StringIO())
     return session.make_trainer(config, folder, built, evaluate, dump, console, resumed=folder.has_checkpoint)
