@@ -14,9 +14,8 @@ from pathlib import Path
 import jax
 import pytest
 
-MAX_MB = 2600
-"""Resident memory that a worker may ever have: four of them, and what they start, fit into 16 GB. Compiling the push of
-`mjx` takes 2150 on its own; the example that trains 2300 after other modules."""
+MAX_MB = 2048
+"""Resident memory that a worker may have; compiling the push of `mjx` and remeshing by CoACD take nearly as much."""
 
 PEAK = pytest.StashKey[int]()
 
@@ -35,23 +34,25 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
 LONGEST = [
-    "test_examples",
+    "test_assets_meshes",
     "test_mjx",
     "test_mjx_contacts",
-    "test_assets_meshes",
-    "test_dump",
+    "test_examples",
     "test_replay",
     "test_training",
-    "test_disk",
-    "test_gymnasium",
+    "test_dump",
     "test_confined",
-    "test_networks",
-    "test_probe_envs",
+    "test_gymnasium",
     "test_cli",
-    "test_heightmap_observation",
+    "test_probe_envs",
+    "test_collect",
+    "test_installed",
+    "test_networks",
+    "test_exploration",
+    "test_policies",
     "test_env",
 ]
-"""Modules to begin with, the longest first, so that no worker ends the run alone with one of them."""
+"""Modules to begin with, so that no worker ends the run alone with one of them; those that take most memory first."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
