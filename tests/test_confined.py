@@ -26,6 +26,7 @@ from pregrasp_jax.spaces.workspace import TABLE, WORKSPACES, Box, Workspace, get
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.grasp import plan_grasp
 from pregrasp_jax.task.place import refuse_blocked, refuse_scenes
+from pregrasp_jax.task.primitive import Primitive
 from pregrasp_jax.task.push import make_push
 from pregrasp_jax.task.rules import _jammed
 from pregrasp_jax.training.session import refuse_mirror
@@ -284,12 +285,25 @@ def test_scenes_that_do_not_fit_a_place_under_every_yaw_are_refused():
 def test_a_place_in_which_no_push_can_be_executed_is_refused():
     gate = tuple(Box(center=(-0.33, y, 0.2), half_size=(0.05, 0.01, 0.2)) for y in (-0.19, 0.19))
     place = Workspace(name="gate", walls=(*gate, Box(center=(-0.2, 0.25, 0.2), half_size=(0.02, 0.05, 0.2))))
-    refuse_blocked(ROBOT, SHELF, make_push(ROBOT, SHELF, TaskConfig(), max_distance=0.2))
+    refuse_blocked(ROBOT, SHELF, push_in(SHELF), mirrored=True)
     blocked = dataclasses.replace(
         place, walls=(*place.walls, Box(center=(-0.205, 0.0, 0.2), half_size=(0.005, 0.2, 0.2)))
     )
     with pytest.raises(ValueError, match=r"workspace 'gate': none of \d+ pushes from the start pose .* \(wall \d+"):
-        refuse_blocked(ROBOT, blocked, make_push(ROBOT, blocked, TaskConfig(), max_distance=0.2))
+        refuse_blocked(ROBOT, blocked, push_in(blocked), mirrored=True)
+
+
+def test_a_place_that_only_the_mirrored_arm_is_stuck_in_is_refused_if_it_starts_there():
+    walls = tuple(Box(center=(x, y, 0.3), half_size=(0.02, 0.01, 0.3)) for x, y in ((-0.55, 0.12), (-0.2, -0.2)))
+    place = Workspace(name="left", walls=walls)
+    refuse_blocked(ROBOT, place, push_in(place), mirrored=False)
+    line = r"'left': none of \d+ pushes from the mirrored start pose .*, or --task.mirrored-start False$"
+    with pytest.raises(ValueError, match=line):
+        refuse_blocked(ROBOT, place, push_in(place), mirrored=True)
+
+
+def push_in(workspace: Workspace) -> Primitive:
+    return make_push(ROBOT, workspace, TaskConfig(), max_distance=0.2)
 
 
 def env_in(workspace: Workspace, robot: Robot = ROBOT, **task: Any) -> Env:

@@ -56,7 +56,7 @@ def make_env(
     scenes = scene_bank.load_or_build(bank, eligible, config.scene, split, threads=threads, progress=progress)
     refuse_scenes(place_of(config.task), scenes)
     env = assemble(config, bank, scenes, eligible=eligible, threads=threads)
-    refuse_blocked(env.robot, env.workspace, env.primitive)
+    refuse_blocked(env.robot, env.workspace, env.primitive, mirrored=config.task.mirrored_start)
     return env
 
 

@@ -1,6 +1,7 @@
 """The place of a task: found by its name and dimensions, and refused where robot or scenes do not fit in."""
 
 import dataclasses
+import functools
 from collections import Counter
 from collections.abc import Callable
 
@@ -72,11 +73,17 @@ def refuse_scenes(workspace: Workspace, scenes: SceneBank) -> None:
         )
 
 
-def refuse_blocked(robot: Robot, workspace: Workspace, primitive: Primitive) -> None:
+def refuse_blocked(robot: Robot, workspace: Workspace, primitive: Primitive, *, mirrored: bool) -> None:
     """Refuse a place between whose walls no action can be executed at the start.
 
+    Args:
+        robot: who moves.
+        workspace: where.
+        primitive: what is tried.
+        mirrored: whether some scenes start in the mirror image of the arm's posture.
+
     Raises:
-        ValueError: one line says what is in the way.
+        ValueError: one line says in which posture, and what is in the way.
     """
     if not workspace.walls:
         return
@@ -85,14 +92,17 @@ def refuse_blocked(robot: Robot, workspace: Workspace, primitive: Primitive) -> 
     tried = jnp.asarray(allowed[:: -(-len(allowed) // _TRIED_ACTIONS)], jnp.int32)
 
     @jax.jit
-    @jax.vmap
-    def obstruction(action: jax.Array) -> jax.Array:
-        return primitive.plan(jnp.asarray(robot.home), primitive.decode(start, action)).obstruction
+    @functools.partial(jax.vmap, in_axes=(0, None))
+    @functools.partial(jax.vmap, in_axes=(None, 0))
+    def obstructions(home: jax.Array, action: jax.Array) -> jax.Array:
+        return primitive.plan(home, primitive.decode(start, action)).obstruction
 
-    found = Counter(OBSTRUCTIONS[code] for code in np.asarray(obstruction(tried)))
-    if not found["none"]:
-        reasons = ", ".join(f"{name} {count}" for name, count in found.most_common())
-        raise ValueError(
-            f"workspace '{workspace.name}': none of {len(tried)} pushes from the start pose of robot {robot.name} can "
-            f"be executed ({reasons}); allowed are walls that leave room for some"
-        )
+    codes = np.asarray(obstructions(jnp.asarray(robot.homes), tried))
+    for posture, found in zip(("", "mirrored ")[: 1 + mirrored], codes, strict=False):
+        if not (found == OBSTRUCTIONS.index("none")).any():
+            reasons = ", ".join(f"{OBSTRUCTIONS[code]} {count}" for code, count in Counter(found).most_common())
+            instead = ", or --task.mirrored-start False" if posture else ""
+            raise ValueError(
+                f"workspace '{workspace.name}': none of {len(tried)} pushes from the {posture}start pose of robot "
+                f"{robot.name} can be executed ({reasons}); allowed are walls that leave room for some{instead}"
+            )
