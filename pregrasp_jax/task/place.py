@@ -97,8 +97,9 @@ def refuse_blocked(robot: Robot, workspace: Workspace, primitive: Primitive, *, 
     def obstructions(home: jax.Array, action: jax.Array) -> jax.Array:
         return primitive.plan(home, primitive.decode(start, action)).obstruction
 
-    codes = np.asarray(obstructions(jnp.asarray(robot.homes), tried))
-    for posture, found in zip(("", "mirrored ")[: 1 + mirrored], codes, strict=False):
+    postures = ("", "mirrored ") if mirrored else ("",)
+    codes = np.asarray(obstructions(jnp.asarray(robot.homes[: len(postures)]), tried))
+    for posture, found in zip(postures, codes, strict=True):
         if not (found == OBSTRUCTIONS.index("none")).any():
             reasons = ", ".join(f"{OBSTRUCTIONS[code]} {count}" for code, count in Counter(found).most_common())
             instead = ", or --task.mirrored-start False" if posture else ""

@@ -9,7 +9,6 @@ from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-
 SECONDS_TO_ANSWER = 1.0
 """How long the end of a loop waits for the answer to a signal; a console that takes nothing is left then."""
 
