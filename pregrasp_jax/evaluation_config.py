@@ -51,7 +51,7 @@ class PlanningConfig:
     """ms for a decision: no round of simulations begins that would exceed it. 0 sets no limit, and results repeat."""
     candidates: int = 10
     """Pushes that the network proposes, 2 cm apart; scripts add to them up to 16."""
-    variants: int = 3
+    variants: int = 8
     """Rebuilt scenes in which a push is tried; all but the first have disturbed poses, sizes and masses."""
     depth: int = 2
     """Pushes of the network that may follow a candidate."""

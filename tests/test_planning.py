@@ -119,8 +119,9 @@ class World:
         self.pushes, self.calls = self.pushes + int(execute.sum()), self.calls + 1
         results = SimpleNamespace(reason=reason, terminated=reason != 0)
         values = np.array([value for _, value in told])
+        actions = np.tile([1, 2], (len(after), 1))
         return SimpleNamespace(
-            states=after, results=results, safety=np.ones(len(after)), values=values, actions=np.ones(len(after), int)
+            states=after, results=results, safety=np.ones(len(after)), values=values, actions=actions
         )
 
     def succeeded(self, reason: np.ndarray) -> np.ndarray:
@@ -161,6 +162,21 @@ def test_continuations_tell_promises_apart():
     rules |= {131: ("off_table", 0.0), 231: ("off_table", 0.0), 141: ("target_in_region", 0.0)}
     assert decide(World(rules), [3, 4]) == 4
     assert decide(World(rules), [3, 4], depth=0) == 3
+
+
+def test_another_continuation_is_tried_where_the_first_fails():
+    """Of what the network would push next the first fails in both lines, the second only in one."""
+    rules = {start + a: ("running", 1.4) for start in (10, 20) for a in (3, 4)}
+    rules |= {131: ("off_table", 0.0), 141: ("off_table", 0.0), 132: ("off_table", 0.0), 142: ("target_in_region", 0.0)}
+    assert decide(World(rules), [3, 4]) == 4
+
+
+def test_what_seems_to_win_is_tried_in_more_variants():
+    """Push 3 wins in the first three variants only, push 4 in all but the first."""
+    rules = {10 * v + 3: ("target_in_region" if v <= 3 else "off_table", 0.0) for v in range(1, 9)}
+    rules |= {10 * v + 4: ("target_in_region" if v > 1 else "off_table", 0.0) for v in range(1, 9)}
+    assert decide(World(rules), [3, 4], variants=3) == 3
+    assert decide(World(rules), [3, 4], variants=8) == 4
 
 
 def test_without_time_one_round_decides():

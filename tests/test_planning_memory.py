@@ -52,6 +52,13 @@ def test_what_the_hand_hides_keeps_its_size_and_place():
     assert np.linalg.norm(blind[0].pose[:2] - [0.02, 0.01]) > 5e-3
 
 
+def test_what_stands_across_the_border_of_the_picture_keeps_its_size():
+    memory = remember(picture([box(0.15, 0.0, 0.3)]))
+    moved = remember(picture([box(0.225, 0.03, 0.6)]), memory)
+    assert area(moved[0].solids.support[0, 0]) == area(memory[0].solids.support[0, 0])
+    np.testing.assert_allclose(moved[0].pose[:2], [0.225, 0.03], atol=3e-3)
+
+
 def test_what_is_hidden_entirely_stays_where_it_was():
     memory = remember(picture([box(0.0, 0.0, 0.3)]))
     after = remember(picture([box(0.0, 0.0, 0.3)], robot=np.ones(ROW.shape, bool)), memory)

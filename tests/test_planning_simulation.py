@@ -31,7 +31,7 @@ def random_bank(seed: int, *, variants: int = 1) -> HullBank:
     height = np.broadcast_to(np.stack([levels[:-1], levels[1:]], axis=1), (count, MAX_HULLS, 2))
     present = np.arange(MAX_HULLS) < rng.integers(1, 4, (count, 1))
     solids = Frustums(support, height, np.repeat(rng.uniform(0, 0.39, (count, 1)), MAX_HULLS, axis=1), present)
-    bank = hull_bank(solids, density=rng.uniform(200, 400, count), friction=0.25)
+    bank = hull_bank(solids, density=rng.uniform(200, 400, count), friction=np.full(count, 0.25))
     standing = np.arange(count) % MAX_OBJECTS < 2
     return bank.replace(object_hulls=np.where(standing[:, None], bank.object_hulls, -1))
 

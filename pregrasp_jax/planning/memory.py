@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from pregrasp_jax.planning import outlines
 from pregrasp_jax.planning.solids import Frustums, directions, mass_properties
@@ -15,7 +16,7 @@ _HIDDEN = 0.93
 _MIN_MATCH = 0.6
 """Share of the cells that must agree, else the remembered shape is not what is seen now: it fell, perhaps."""
 
-PINHOLE_EDGE = 1.8e-3
+PINHOLE_EDGE = 2.0e-3
 """m by which a pinhole camera's heightmap shows objects too large on all sides: a cell is theirs if any point is."""
 
 _COARSE = np.deg2rad(np.arange(-180, 180, 15))
@@ -91,12 +92,13 @@ def _look_at(
         pose, match = _register(shape, xy, mask, height, hidden)
         if match > _MIN_MATCH:
             return shape._replace(pose=pose, seen=seen)
-    return _new_shape(xy, z, seen, edge)
+    others = grid.cell_to_world(*np.nonzero(_around(mask) & ~mask & ~hidden))
+    return _new_shape(xy, z, others, seen, edge)
 
 
-def _new_shape(xy: np.ndarray, height: np.ndarray, seen: np.ndarray, edge: float) -> Shape:
-    """Return an object rebuilt from the cells [N, 2] m that are seen of it now."""
-    solids = outlines.stack(xy, height, edge=edge)
+def _new_shape(xy: np.ndarray, height: np.ndarray, others: np.ndarray, seen: np.ndarray, edge: float) -> Shape:
+    """Return an object rebuilt from the cells [N, 2] m that are seen of it now, and `others` [M, 2] around it."""
+    solids = outlines.stack(xy, height, others, edge=edge)
     centre = mass_properties(Frustums(*(column[None] for column in solids))).com[0, :2]
     local = moved(solids, -centre)
     return Shape(local, xy - centre, height, np.array([*centre, 0.0]), seen)
@@ -109,10 +111,13 @@ def moved(solids: Frustums, offset: np.ndarray) -> Frustums:
 
 
 def _touches(mask: np.ndarray, hidden: np.ndarray) -> bool:
-    """Return whether a hidden cell is next to one of the object."""
-    padded = np.pad(mask, 1)
-    near = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
-    return bool((near & hidden).any())
+    """Return whether a cell next to one of the object is hidden, or would be beyond the picture."""
+    return bool((_around(np.pad(mask, 1)) & np.pad(hidden, 1, constant_values=True)).any())
+
+
+def _around(mask: np.ndarray) -> np.ndarray:
+    """Return the cells [H, W] bool of an object and those next to them, across corners too."""
+    return binary_dilation(mask, np.ones((3, 3)))
 
 
 def _register(

@@ -1,8 +1,8 @@
 """From the cells of one object to a stack of frustums.
 
-A cell belongs to an object if its centre does, so that the number of cells is an unbiased measure of the area. The
-convex outline of the centres is therefore grown until it has that area: on smooth objects this meets the true outline
-within 1 mm, a fifth of a cell.
+A cell belongs to an object if its centre does. So every side of the outline lies between the outermost centre of the
+object and the nearest centre in front of that side that is seen to be none of it, and halfway is the best guess: on
+built-in and scanned objects a side is off by 1.2 mm (standard deviation), a quarter of a cell, and 0.15 mm too far out.
 """
 
 import numpy as np
@@ -35,37 +35,42 @@ _MIN_HEIGHT = 0.01
 """m; what is seen lower than this is taken to be as high."""
 
 _TURNS = np.linspace(0, 2 * np.pi / NUM_SIDES, 9)[:-1]
-_GAP = np.array([0.0, 1.0]) * _CELL
-"""m; between the outermost centres and the outline lies at most a cell."""
+_PASSES = 4
+"""Sides hide cells from each other: they are moved outward together, a few times."""
 
 
-def stack(xy: np.ndarray, height: np.ndarray, *, edge: float = 0.0) -> Frustums:
+def stack(xy: np.ndarray, height: np.ndarray, others: np.ndarray, *, edge: float = 0.0) -> Frustums:
     """Return the frustums [MAX_HULLS] of an object in the world.
 
     Args:
         xy: [N, 2] m, centres of its cells, at least one.
         height: [N] m above the table.
+        others: [M, 2] m, centres of cells around it that are seen to be none of it.
         edge: m by which the camera sees objects too large on all sides.
     """
     parts = _split(xy, np.maximum(height, _MIN_HEIGHT))
     budget = max(1, MAX_HULLS // len(parts))
-    found = [layer for part in parts for layer in _layers(*part, edge, min(budget, _MAX_LAYERS))][:MAX_HULLS]
+    found = [layer for part in parts for layer in _layers(*part, others, edge, min(budget, _MAX_LAYERS))][:MAX_HULLS]
     absent = MAX_HULLS - len(found)
     found += found[-1:] * absent
     support, heights, angle = (np.stack(column) for column in zip(*found, strict=True))
     return Frustums(support, heights, angle, np.arange(MAX_HULLS) < MAX_HULLS - absent)
 
 
-def outline(xy: np.ndarray, angle: float, *, edge: float = 0.0) -> np.ndarray:
-    """Return the support [NUM_SIDES] m of the convex outline of cells [N, 2] that has their area."""
-    support = (xy @ directions(np.asarray(angle)).T).max(axis=0)
-    wanted = len(xy) * _CELL**2
-    # The area of an outline grown by d is that of a polynomial of degree two in d.
-    start, one, two = (area(support + d) for d in (0.0, _CELL, 2 * _CELL))
-    quadratic = (two - 2 * one + start) / 2
-    linear = one - start - quadratic
-    root = (-linear + np.sqrt(max(linear**2 - 4 * quadratic * (start - wanted), 0.0))) / (2 * quadratic)
-    return support + np.clip(root * _CELL, *_GAP) - edge
+def outline(xy: np.ndarray, others: np.ndarray, angle: float) -> np.ndarray:
+    """Return the support [NUM_SIDES] m of the convex outline around cells [N, 2], halfway to `others` [M, 2].
+
+    Where nothing is known of what is in front of a side, it lies half a cell beyond the outermost centre.
+    """
+    normal = directions(np.asarray(angle)).T
+    inner, reach = (xy @ normal).max(axis=0), others @ normal
+    support = inner
+    for _ in range(_PASSES):
+        beyond = reach > support + 1e-9
+        in_front = beyond & (beyond.sum(axis=1) == 1)[:, None]
+        outer = np.where(in_front, reach, np.inf).min(axis=0, initial=np.inf)
+        support = (inner + np.minimum(outer, inner + _CELL)) / 2
+    return support
 
 
 def turn_of(xy: np.ndarray) -> float:
@@ -74,7 +79,9 @@ def turn_of(xy: np.ndarray) -> float:
     return float(_TURNS[np.argmin(area(support))])
 
 
-def _layers(xy: np.ndarray, height: np.ndarray, edge: float, most: int) -> list[tuple[np.ndarray, np.ndarray, float]]:
+def _layers(
+    xy: np.ndarray, height: np.ndarray, others: np.ndarray, edge: float, most: int
+) -> list[tuple[np.ndarray, np.ndarray, float]]:
     """Return (support [2, NUM_SIDES], z [2], angle) of the layers of a part, from the table up."""
     top = float(height.max())
     levels = np.linspace(0.0, top, _NUM_LEVELS + 1)
@@ -86,8 +93,9 @@ def _layers(xy: np.ndarray, height: np.ndarray, edge: float, most: int) -> list[
     for first, last in _pieces(counts[:usable].astype(float), most):
         pair = []
         for level in (first, last):
-            cells = xy[height >= middles[level]]
-            pair.append(outline(cells if len(cells) else xy, angle, edge=edge))
+            high = height >= middles[level]
+            high = high if high.any() else ~high
+            pair.append(outline(xy[high], np.concatenate([xy[~high], others]), angle) - edge)
         end = levels[last + 1] if last + 1 < usable else top
         # No higher layer is wider, in whatever direction: what is above a cell stands on it.
         layers.append((np.stack([pair[0], np.minimum(pair[0], pair[1])]), np.array([levels[first], end]), angle))

@@ -7,7 +7,7 @@ import numpy as np
 from pregrasp_jax.assets.bank import DEFAULT_DENSITY, DEFAULT_FRICTION
 from pregrasp_jax.planning.memory import Memory, solids_of
 from pregrasp_jax.planning.separate import separate
-from pregrasp_jax.planning.solids import Frustums, hull_bank, tighten
+from pregrasp_jax.planning.solids import NUM_SIDES, Frustums, hull_bank, tighten
 from pregrasp_jax.scene.model import parking_poses
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.types import MAX_OBJECTS, ROBOT_ID, TABLE_ID, HullBank, Observation
@@ -15,8 +15,11 @@ from pregrasp_jax.types import MAX_OBJECTS, ROBOT_ID, TABLE_ID, HullBank, Observ
 SHRINK = 0.5e-3
 """m by which objects are drawn in on all sides, lest those that touch each other overlap."""
 
-POSITION_JITTER, TURN_JITTER, SIZE_JITTER, MASS_JITTER = 2e-3, 0.03, 0.7e-3, 1.6
-"""m, rad, m (standard deviations) and the largest factor, by which variants differ from what is seen."""
+POSITION_JITTER, TURN_JITTER, SIDE_JITTER = 2e-3, 0.04, 1.2e-3
+"""m, rad, m: standard deviations of the poses of objects, and of every side of theirs, from what is seen."""
+
+MASS_JITTER, FRICTION_JITTER = 1.6, 1.4
+"""Largest factors by which variants differ from what is assumed."""
 
 _RAYS = np.linspace(0.02, 0.3, 15)
 """Shares of the way from the table to a camera 1 m above it at which something may stand in between."""
@@ -52,16 +55,17 @@ def draw_variants(memory: Memory, robot: np.ndarray, count: int, rng: np.random.
     poses = np.stack([shape.pose if shape is not None else _NOWHERE for shape in memory])
     disturbed = (np.arange(count) > 0)[:, None]
     shape = (count, MAX_OBJECTS)
-    grown = disturbed * SIZE_JITTER * rng.standard_normal(shape) - SHRINK
+    grown = disturbed[..., None] * SIDE_JITTER * rng.standard_normal((*shape, NUM_SIDES)) - SHRINK
     density = DEFAULT_DENSITY * MASS_JITTER ** (disturbed * rng.uniform(-1, 1, shape))
+    friction = DEFAULT_FRICTION * FRICTION_JITTER ** (disturbed * rng.uniform(-1, 1, shape))
     off = rng.standard_normal((*shape, 3)) * [POSITION_JITTER, POSITION_JITTER, TURN_JITTER]
     places = poses + disturbed[..., None] * off
     varied = [
-        separate(solids._replace(support=tighten(solids.support + size[:, None, None, None])), place, robot)
-        for size, place in zip(grown, places, strict=True)
+        separate(solids._replace(support=tighten(solids.support + sides[:, None, None])), place, robot)
+        for sides, place in zip(grown, places, strict=True)
     ]
     joined = Frustums(*(np.concatenate(columns) for columns in zip(*varied, strict=True)))
-    bank = hull_bank(joined, density=density.ravel(), friction=DEFAULT_FRICTION)
+    bank = hull_bank(joined, density=density.ravel(), friction=friction.ravel())
     hulls = np.where(np.tile(known, count)[:, None], bank.object_hulls, -1)
     standing = np.where(known[:, None], _standing(places), parking_poses()).astype(np.float32)
     return Variants(bank.replace(object_hulls=hulls), standing, known)

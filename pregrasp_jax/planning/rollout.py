@@ -11,7 +11,7 @@ import numpy as np
 from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.physics.native import engine_of
 from pregrasp_jax.planning.simulation import Simulations
-from pregrasp_jax.policies import scripts
+from pregrasp_jax.policies import exploration, scripts
 from pregrasp_jax.task import registry
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.task.grasp import TRIAL_HOLD
@@ -21,6 +21,9 @@ from pregrasp_jax.types import EnvState, GraspResult, HandPose, HullBank, Observ
 
 NUM_SCRIPTED = 8
 """Pushes that scripts propose: `straight`, `clear`, and as many guided as uniform ones."""
+
+NUM_NEXT, _APART = 3, 0.02
+"""Pushes that the network proposes after a simulated one, and how far apart they are, m."""
 
 _MOVED, _EDGE = 0.005, 0.02
 """m; an object that moved more than this and ended nearer to an edge than that may have fallen in truth: where objects
@@ -35,7 +38,7 @@ class Pushed(NamedTuple):
         results: what the rules say.
         safety: [B] how likely nothing else has left the workspace than what has left here.
         values: [B] of the best push that the network knows next.
-        actions: [B] int32, that push.
+        actions: [B, NUM_NEXT] int32, that push and others that it knows.
     """
 
     states: EnvState
@@ -172,8 +175,11 @@ class Rollout:
         safety = jax.vmap(self._safety)(states.centroids, moved & (states.scene.object_ids >= 0), states.scene.target)
         inputs = jax.vmap(self._q.input_fn)(states.obs, states.scene.target)
         q = jnp.where(jax.vmap(env.action_mask)(states.hand), self._q.apply(params, inputs), -jnp.inf)
-        flat = q.reshape(self.batch, -1)
-        return Pushed(states, results, safety, flat.max(axis=1), flat.argmax(axis=1).astype(jnp.int32))
+        return Pushed(states, results, safety, q.max(axis=(1, 2, 3)), jax.vmap(self._next)(q))
+
+    def _next(self, q: jax.Array) -> jax.Array:
+        actions = self._env.primitive.actions
+        return exploration.best_apart(q, jnp.isfinite(q), actions, count=NUM_NEXT, spacing=_APART)
 
     def _safety(self, centroids: jax.Array, moved: jax.Array, target: jax.Array) -> jax.Array:
         """Return how likely those of the objects [MAX_OBJECTS] that `moved` have stayed in the workspace indeed."""

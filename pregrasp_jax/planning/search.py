@@ -1,7 +1,8 @@
 """Which of several first pushes does best: rounds of simulations, in each of which fewer candidates stay."""
 
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax
@@ -11,16 +12,17 @@ from pregrasp_jax.evaluation_config import PlanningConfig
 from pregrasp_jax.planning.rollout import Rollout
 from pregrasp_jax.types import EnvState, HullBank
 
-ROUNDS = (8, 4)
-"""Candidates that stay for the second round and for the third."""
+ROUNDS = (8, 4, 2)
+"""Candidates that stay for the second round and those after it. Round n makes n pushes for each of them: one more in
+every variant where something may follow, and the others in new variants."""
 
 DISCOUNT = 0.93
 """What a success one push later is worth."""
 
 SALVAGE = 0.6
-"""Share of its worth that a line keeps whose continuation failed: another push can be chosen then."""
+"""Share of its promise that a state keeps after every continuation that has been tried: another can be chosen then."""
 
-SLIPPED = 0.7
+SLIPPED = 0.85
 """Share of its worth that an enclosed target keeps which the simulated grasp does not hold: in truth 97 of 100 enclosed
 targets are held, and a rebuilt shape may slip where the object does not."""
 
@@ -42,28 +44,40 @@ class Choice(NamedTuple):
 
 
 @dataclass
-class Line:
-    """A candidate in one variant of the rebuilt scene, as far as it has been followed.
+class Node:
+    """Where a line of pushes has led in one variant of the rebuilt scene.
 
     Attributes:
-        candidate: which.
-        variant: which.
-        action: what is pushed next.
-        state: where it stands.
+        state: that scene now, host arrays.
+        proposals: what may be pushed next, best first; none once the episode has ended.
         depth: pushes so far.
-        worth: how likely it ends in a success, discounted by the pushes that takes.
-        safety: how likely nothing has left the workspace until now.
-        ended: nothing follows.
+        safety: how likely nothing else has left the workspace until now than what has left.
+        promise: how likely the episode ends well, discounted by the pushes that takes, if no continuation is known.
+        children: where the first of the proposals have led.
     """
 
-    candidate: int
-    variant: int
-    action: int
     state: EnvState
+    proposals: list[int]
     depth: int = 0
-    worth: float = 0.0
     safety: float = 1.0
-    ended: bool = False
+    promise: float = 0.0
+    children: "list[Node]" = field(default_factory=list)
+
+    @property
+    def remainder(self) -> float:
+        """What the proposals that have not been tried promise; every one that has been takes its share."""
+        return self.promise * SALVAGE ** len(self.children)
+
+    @property
+    def worth(self) -> float:
+        """What the best continuation is worth that is known."""
+        return max([self.remainder, *(child.worth for child in self.children)])
+
+    def nodes(self) -> "Iterator[Node]":
+        """Iterate over this node and all that follow from it."""
+        yield self
+        for child in self.children:
+            yield from child.nodes()
 
 
 def chance(values: np.ndarray) -> np.ndarray:
@@ -74,7 +88,7 @@ def chance(values: np.ndarray) -> np.ndarray:
 def search(
     rollout: Rollout, bank: HullBank, roots: EnvState, candidates: list[int], config: PlanningConfig, deadline: float
 ) -> Choice:
-    """Return the candidate that does best on average over variants.
+    """Return the candidate that does best on average over variants, by rounds in which fewer and fewer stay.
 
     Args:
         rollout: simulates.
@@ -84,65 +98,64 @@ def search(
         config: how deep, in how many variants.
         deadline: by `time.perf_counter`; no round begins that would not end before it.
     """
-    lines: list[Line] = []
-    kept, last = len(candidates), 0.0
-    for keep in (len(candidates), *ROUNDS):
+    trees: list[list[Node]] = [[] for _ in candidates]
+    best, last = list(range(len(candidates))), 0.0
+    for number, keep in enumerate((len(candidates), *ROUNDS)):
         begin = time.perf_counter()
-        if lines and begin + last > deadline:
+        if number and begin + last > deadline:
             break
-        kept = min(kept, keep)
-        best = _ranked(lines, len(candidates))[:kept]
-        further = [line for line in lines if line.candidate in best and not line.ended and line.depth <= config.depth]
-        fresh = _in_another_variant(lines, best, candidates, roots, config.variants)
-        _follow(rollout, bank, further + fresh)
-        lines += fresh
+        best = sorted(best, key=lambda c: -_mean_worth(trees[c]))[:keep]
+        due = [n for c in best for n in _due(trees[c], candidates[c], roots, 1 + number, config)]
+        for start in range(0, len(due), rollout.batch):
+            _follow(rollout, bank, due[start : start + rollout.batch])
         last = time.perf_counter() - begin
-    return Choice(candidates[_ranked(lines, len(candidates))[0]], sum(line.depth for line in lines))
+    pushes = sum(node.depth > 0 for of_candidate in trees for tree in of_candidate for node in tree.nodes())
+    return Choice(candidates[max(best, key=lambda c: _mean_worth(trees[c]))], pushes)
 
 
-def _ranked(lines: list[Line], count: int) -> list[int]:
-    """Return `count` candidates, best first: those tried in more variants before the others."""
-    worth = [[line.worth for line in lines if line.candidate == candidate] for candidate in range(count)]
-    return sorted(range(count), key=lambda c: (-len(worth[c]), -sum(worth[c]), c))
+def _due(trees: list[Node], action: int, roots: EnvState, count: int, config: PlanningConfig) -> list[Node]:
+    """Return from where a candidate, `action`, is pushed on in a round of `count` pushes; new variants join its trees."""
+    found = [_most_promising(tree, config.depth) for tree in trees]
+    further = [node for node in found if node is not None]
+    tried = len(trees)
+    for variant in range(tried, min(tried + count - len(further), config.variants)):
+        trees.append(Node(jax.tree.map(lambda leaf, v=variant: leaf[v], roots), [action]))
+    return further + trees[tried:]
 
 
-def _in_another_variant(
-    lines: list[Line], best: list[int], candidates: list[int], roots: EnvState, num_variants: int
-) -> list[Line]:
-    """Return the beginnings of lines of the best candidates in the first variants that they were not tried in."""
-    fresh = []
-    for candidate in best:
-        variant = sum(line.candidate == candidate for line in lines)
-        if variant < num_variants:
-            state = jax.tree.map(lambda leaf, v=variant: leaf[v], roots)
-            fresh.append(Line(candidate, variant, candidates[candidate], state))
-    return fresh
+def _mean_worth(trees: list[Node]) -> float:
+    """Return what a candidate is worth on average over the variants that it has been tried in, at least one."""
+    return sum(tree.worth for tree in trees) / max(len(trees), 1)
 
 
-def _follow(rollout: Rollout, bank: HullBank, lines: list[Line]) -> None:
-    """Push once more on every line, a batch at a time."""
-    for start in range(0, len(lines), rollout.batch):
-        _follow_batch(rollout, bank, lines[start : start + rollout.batch])
+def _most_promising(tree: Node, max_depth: int) -> Node | None:
+    """Return the node after 1 to `max_depth` pushes whose next proposal promises most; None if there is none."""
+    nodes = (node for node in tree.nodes() if 0 < node.depth <= max_depth and node.proposals[len(node.children) :])
+    return max(nodes, key=lambda node: node.remainder, default=None)
 
 
-def _follow_batch(rollout: Rollout, bank: HullBank, lines: list[Line]) -> None:
-    padded = lines + lines[-1:] * (rollout.batch - len(lines))
-    real = np.arange(rollout.batch) < len(lines)
-    states = jax.tree.map(lambda *leaves: np.stack(leaves), *(line.state for line in padded))
-    pushed = rollout.push(bank, states, np.array([line.action for line in padded], np.int32), real)
+def _follow(rollout: Rollout, bank: HullBank, nodes: list[Node]) -> None:
+    """Try the next proposal of every node, at most a batch of them."""
+    padded = nodes + nodes[-1:] * (rollout.batch - len(nodes))
+    real = np.arange(rollout.batch) < len(nodes)
+    states = jax.tree.map(lambda *leaves: np.stack(leaves), *(node.state for node in padded))
+    actions = np.array([node.proposals[len(node.children)] for node in padded], np.int32)
+    pushed = rollout.push(bank, states, actions, real)
     enclosed = real & rollout.succeeded(pushed.results.reason)
     held = rollout.grasp(bank, pushed.states, enclosed)
-    host = jax.device_get(pushed.states)
+    ends, proposals, terminated = jax.device_get((pushed.states, pushed.actions, pushed.results.terminated))
     chances = chance(np.asarray(pushed.values))
-    for i, line in enumerate(lines):
-        line.safety *= float(pushed.safety[i])
-        discount = line.safety * DISCOUNT**line.depth
+    for i, node in enumerate(nodes):
+        safety = node.safety * float(pushed.safety[i])
         if enclosed[i]:
-            line.worth = discount * (1.0 if held[i] else SLIPPED)
-        elif pushed.results.terminated[i]:
-            line.worth = SALVAGE * line.worth  # 0 for the candidate itself
+            promise = 1.0 if held[i] else SLIPPED
         else:
-            line.worth = discount * DISCOUNT * float(chances[i])
-        line.ended = bool(pushed.results.terminated[i])
-        line.action, line.depth = int(pushed.actions[i]), line.depth + 1
-        line.state = jax.tree.map(lambda leaf, i=i: leaf[i], host)
+            promise = 0.0 if terminated[i] else DISCOUNT * float(chances[i])
+        child = Node(
+            state=jax.tree.map(lambda leaf, i=i: leaf[i], ends),
+            proposals=[] if terminated[i] else proposals[i].tolist(),
+            depth=node.depth + 1,
+            safety=safety,
+            promise=promise * safety * DISCOUNT**node.depth,
+        )
+        node.children.append(child)

@@ -7,9 +7,14 @@ from pregrasp_jax.planning.solids import NUM_SIDES, Frustums, corners, direction
 ALLOWED = 3e-4
 """m of overlap that stays."""
 
+CORE = 3e-3
+"""m; radius around the middle of a part that is never cut away, whatever it overlaps."""
+
 
 def separate(solids: Frustums, poses: np.ndarray, robot: np.ndarray) -> Frustums:
     """Return objects cut back to where nothing overlaps, along the sides where that takes least.
+
+    Where two of them claim the middle of a part some overlap stays: no solid would be left.
 
     Args:
         solids: [N, P] frustums in the frames of their objects.
@@ -19,6 +24,8 @@ def separate(solids: Frustums, poses: np.ndarray, robot: np.ndarray) -> Frustums
     owner, part = np.nonzero(solids.present)
     support, height = solids.support[owner, part].copy(), solids.height[owner, part]
     world = solids.angle[owner, part] + poses[owner, 2]
+    middle = corners(support[:, 1], solids.angle[owner, part]).mean(axis=1)
+    core = np.einsum("pki,pi->pk", directions(solids.angle[owner, part]), middle) + CORE
     normal = directions(world)
     outward = support + (normal @ poses[owner, :2, None])[:, None, :, 0]
     flat = corners(outward, world[:, None]).reshape(len(owner), 2 * NUM_SIDES, 2)
@@ -36,7 +43,8 @@ def separate(solids: Frustums, poses: np.ndarray, robot: np.ndarray) -> Frustums
         cut, other = (first, second) if widest[first, second] >= best[first, second] else (second, first)
         side = int(np.argmax(gap[cut, :, other]))
         beyond = solids.support[owner[cut], part[cut], :, side].max() + gap[cut, side, other]
-        support[cut, :, side] = np.minimum(support[cut, :, side], beyond + ALLOWED)
+        limit = max(beyond + ALLOWED, core[cut, side])
+        support[cut, :, side] = np.minimum(support[cut, :, side], limit)
     result = solids.support.copy()
     result[owner, part] = tighten(support)
     return solids._replace(support=result)

@@ -108,7 +108,7 @@ def _template() -> HullBank:
         angle=np.zeros(shape),
         present=np.ones(shape, bool),
     )
-    return hull_bank(solids, density=np.full(MAX_OBJECTS, 300.0), friction=0.25)
+    return hull_bank(solids, density=np.full(MAX_OBJECTS, 300.0), friction=np.full(MAX_OBJECTS, 0.25))
 
 
 class _Writer:

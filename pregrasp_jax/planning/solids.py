@@ -164,13 +164,13 @@ def polygon_moments(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
     return cross.sum(axis=-1) / 2, np.einsum("...p,...pi->...i", cross, total) / 6, second / 24
 
 
-def hull_bank(solids: Frustums, *, density: np.ndarray, friction: float) -> HullBank:
+def hull_bank(solids: Frustums, *, density: np.ndarray, friction: np.ndarray) -> HullBank:
     """Return objects [N] of frustums [N, MAX_HULLS] as a hull bank, whose arrays may be arguments of compiled programs.
 
     Args:
         solids: the first frustum of every object is present; centres of mass lie above the origin of the object frame.
         density: [N] kg/m^3.
-        friction: against other objects.
+        friction: [N] of their surfaces.
     """
     count = len(solids.present)
     found = mass_properties(solids)
@@ -190,7 +190,7 @@ def hull_bank(solids: Frustums, *, density: np.ndarray, friction: float) -> Hull
         "com": found.com,
         "inertia": moments,
         "inertia_quat": _quaternions(axes),
-        "friction": np.full(count, friction),
+        "friction": friction,
         "height": np.where(solids.present, solids.height[..., 1], 0.0).max(axis=1),
         "min_width": np.zeros(count),
     }
