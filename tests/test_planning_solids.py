@@ -82,9 +82,13 @@ def rebuilt(inside: np.ndarray, height: np.ndarray | float) -> Frustums:
     return outlines.stack(XY[inside], np.broadcast_to(height, inside.shape)[inside], XY[~inside])
 
 
-@pytest.mark.parametrize(("length", "width", "rounding"), [(0.035, 0.035, 0.035), (0.03, 0.03, 0.006), (0.048, 0.033, 0.012)])
+CAN, CARTON, BOTTLE = (0.035, 0.035, 0.035), (0.03, 0.03, 0.006), (0.048, 0.033, 0.012)
+"""Half sizes and the radius of the corners, m."""
+
+
+@pytest.mark.parametrize(("length", "width", "rounding"), [CAN, CARTON, BOTTLE])
 def test_sides_are_off_by_a_quarter_of_a_cell(length: float, width: float, rounding: float):
-    """Can, carton and bottle: half sizes, m, and the radius of the corners, wherever and however they stand."""
+    """Wherever and however an object stands."""
     rng = np.random.default_rng(0)
     core = np.array([length, width]) - rounding
     off, extent = [], []

@@ -114,7 +114,10 @@ def search(
 
 
 def _due(trees: list[Node], action: int, roots: EnvState, count: int, config: PlanningConfig) -> list[Node]:
-    """Return from where a candidate, `action`, is pushed on in a round of `count` pushes; new variants join its trees."""
+    """Return from where a candidate, `action`, is pushed on in a round of `count` pushes.
+
+    Where nothing follows in the variants that it has been tried in, new ones join its `trees`.
+    """
     found = [_most_promising(tree, config.depth) for tree in trees]
     further = [node for node in found if node is not None]
     tried = len(trees)
