@@ -110,8 +110,6 @@ class Rollout:
 
     def grasp(self, bank: HullBank, states: EnvState, execute: np.ndarray) -> np.ndarray:
         """Return which grasps hold, [B] bool; those not to be executed [B] do not."""
-        if not execute.any():
-            return execute
         return np.asarray(self._run("grasp", self._grasp, bank, states, execute).held)
 
     def _run(self, name: str, stages: Stages, *args: Any) -> Any:

@@ -16,6 +16,9 @@ ROUNDS = (8, 4, 2)
 """Candidates that stay for the second round and those after it. Round n makes n pushes for each of them: one more in
 every variant where something may follow, and the others in new variants."""
 
+GRASPED = 4
+"""Once so few candidates are left their grasps are tried, which takes long, and nearly all that is enclosed is held."""
+
 DISCOUNT = 0.93
 """What a success one push later is worth."""
 
@@ -53,6 +56,7 @@ class Node:
         depth: pushes so far.
         safety: how likely nothing else has left the workspace until now than what has left.
         promise: how likely the episode ends well, discounted by the pushes that takes, if no continuation is known.
+        ungrasped: whether the target is enclosed and its grasp has yet to be tried.
         children: where the first of the proposals have led.
     """
 
@@ -61,6 +65,7 @@ class Node:
     depth: int = 0
     safety: float = 1.0
     promise: float = 0.0
+    ungrasped: bool = False
     children: "list[Node]" = field(default_factory=list)
 
     @property
@@ -106,8 +111,12 @@ def search(
             break
         best = sorted(best, key=lambda c: -_mean_worth(trees[c]))[:keep]
         due = [n for c in best for n in _due(trees[c], candidates[c], roots, 1 + number, config)]
-        for start in range(0, len(due), rollout.batch):
-            _follow(rollout, bank, due[start : start + rollout.batch])
+        for nodes in _batches(due, rollout.batch):
+            _follow(rollout, bank, nodes)
+        if len(best) <= GRASPED:
+            enclosing = [n for c in best for tree in trees[c] for n in tree.nodes() if n.ungrasped]
+            for nodes in _batches(enclosing, rollout.batch):
+                _grasp(rollout, bank, nodes)
         last = time.perf_counter() - begin
     pushes = sum(node.depth > 0 for of_candidate in trees for tree in of_candidate for node in tree.nodes())
     return Choice(candidates[max(best, key=lambda c: _mean_worth(trees[c]))], pushes)
@@ -137,28 +146,42 @@ def _most_promising(tree: Node, max_depth: int) -> Node | None:
     return max(nodes, key=lambda node: node.remainder, default=None)
 
 
+def _batches(nodes: list[Node], size: int) -> list[list[Node]]:
+    return [nodes[start : start + size] for start in range(0, len(nodes), size)]
+
+
+def _padded(nodes: list[Node], size: int) -> tuple[list[Node], np.ndarray, EnvState]:
+    """Return a batch of nodes, the last one repeated, which of them are real [B] bool, and their states [B]."""
+    padded = nodes + nodes[-1:] * (size - len(nodes))
+    states = jax.tree.map(lambda *leaves: np.stack(leaves), *(node.state for node in padded))
+    return padded, np.arange(size) < len(nodes), states
+
+
 def _follow(rollout: Rollout, bank: HullBank, nodes: list[Node]) -> None:
     """Try the next proposal of every node, at most a batch of them."""
-    padded = nodes + nodes[-1:] * (rollout.batch - len(nodes))
-    real = np.arange(rollout.batch) < len(nodes)
-    states = jax.tree.map(lambda *leaves: np.stack(leaves), *(node.state for node in padded))
+    padded, real, states = _padded(nodes, rollout.batch)
     actions = np.array([node.proposals[len(node.children)] for node in padded], np.int32)
     pushed = rollout.push(bank, states, actions, real)
-    enclosed = real & rollout.succeeded(pushed.results.reason)
-    held = rollout.grasp(bank, pushed.states, enclosed)
     ends, proposals, terminated = jax.device_get((pushed.states, pushed.actions, pushed.results.terminated))
-    chances = chance(np.asarray(pushed.values))
+    enclosed = rollout.succeeded(pushed.results.reason)
+    chances = np.where(terminated, enclosed, DISCOUNT * chance(np.asarray(pushed.values)))
     for i, node in enumerate(nodes):
         safety = node.safety * float(pushed.safety[i])
-        if enclosed[i]:
-            promise = 1.0 if held[i] else SLIPPED
-        else:
-            promise = 0.0 if terminated[i] else DISCOUNT * float(chances[i])
         child = Node(
             state=jax.tree.map(lambda leaf, i=i: leaf[i], ends),
             proposals=[] if terminated[i] else proposals[i].tolist(),
             depth=node.depth + 1,
             safety=safety,
-            promise=promise * safety * DISCOUNT**node.depth,
+            promise=float(chances[i]) * safety * DISCOUNT**node.depth,
+            ungrasped=bool(enclosed[i]),
         )
         node.children.append(child)
+
+
+def _grasp(rollout: Rollout, bank: HullBank, nodes: list[Node]) -> None:
+    """Try the grasps of nodes whose target is enclosed, at most a batch of them."""
+    _, real, states = _padded(nodes, rollout.batch)
+    held = rollout.grasp(bank, states, real)
+    for node, holds in zip(nodes, held, strict=False):
+        node.ungrasped = False
+        node.promise *= 1.0 if holds else SLIPPED
