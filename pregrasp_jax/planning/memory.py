@@ -10,7 +10,7 @@ from pregrasp_jax.planning.solids import Frustums, directions, mass_properties
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, Observation
 
-_HIDDEN = 0.93
+_HIDDEN = 0.98
 """An object beside what hides it is itself hidden if less than this share is seen of what was seen before."""
 
 _MIN_MATCH = 0.6

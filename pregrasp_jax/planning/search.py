@@ -16,8 +16,9 @@ ROUNDS = (8, 4, 2)
 """Candidates that stay for the second round and those after it. Round n makes n pushes for each of them: one more in
 every variant where something may follow, and the others in new variants."""
 
-GRASPED = 4
-"""Once so few candidates are left their grasps are tried, which takes long, and nearly all that is enclosed is held."""
+GRASPED = 2
+"""Candidates whose grasps are tried, one batch in all: it takes long, nearly all that is enclosed is held, and what
+slips in one variant slips in most."""
 
 DISCOUNT = 0.93
 """What a success one push later is worth."""
@@ -114,9 +115,7 @@ def search(
         for nodes in _batches(due, rollout.batch):
             _follow(rollout, bank, nodes)
         if len(best) <= GRASPED:
-            enclosing = [n for c in best for tree in trees[c] for n in tree.nodes() if n.ungrasped]
-            for nodes in _batches(enclosing, rollout.batch):
-                _grasp(rollout, bank, nodes)
+            _grasp(rollout, bank, [trees[c] for c in best])
         last = time.perf_counter() - begin
     pushes = sum(node.depth > 0 for of_candidate in trees for tree in of_candidate for node in tree.nodes())
     return Choice(candidates[max(best, key=lambda c: _mean_worth(trees[c]))], pushes)
@@ -178,10 +177,13 @@ def _follow(rollout: Rollout, bank: HullBank, nodes: list[Node]) -> None:
         node.children.append(child)
 
 
-def _grasp(rollout: Rollout, bank: HullBank, nodes: list[Node]) -> None:
-    """Try the grasps of nodes whose target is enclosed, at most a batch of them."""
+def _grasp(rollout: Rollout, bank: HullBank, best: list[list[Node]]) -> None:
+    """Try the grasps of the candidates that are left, given by their trees; each gets its share of one batch."""
+    enclosing = ([node for tree in trees for node in tree.nodes() if node.ungrasped] for trees in best)
+    nodes = [node for found in enclosing for node in found[: rollout.batch // GRASPED]]
+    if not nodes:
+        return
     _, real, states = _padded(nodes, rollout.batch)
-    held = rollout.grasp(bank, states, real)
-    for node, holds in zip(nodes, held, strict=False):
+    for node, holds in zip(nodes, rollout.grasp(bank, states, real), strict=False):
         node.ungrasped = False
         node.promise *= 1.0 if holds else SLIPPED
