@@ -72,7 +72,7 @@ def test_a_planner_is_told_what_the_camera_sees_and_where_the_joints_are():
         actions = Deliberation(recorder, jax.random.key(3))(make_states(seed), np.ones(3, bool))
         told.append(recorder.told)
         assert actions.tolist() == [1, 2, 1]  # scene 4 stands there twice
-    assert Sight._fields == ("obs", "joint_pos", "target")
+    assert Sight._fields == ("obs", "joint_pos", "target", "pushes")
     jax.tree.map(np.testing.assert_array_equal, *told)
     assert [memory for _, memory, _ in told[0]] == [NOTHING] * 2
 
@@ -131,10 +131,10 @@ class World:
         return execute & (states % 10 != 7)  # what ends with push 7 slips
 
 
-def decide(world: World, candidates: list[int], deadline: float = math.inf, **settings: int) -> int:
+def decide(world: World, candidates: list[int], *, left: int = 10, deadline: float = math.inf, **settings: int) -> int:
     config = PlanningConfig(**{"variants": 2, "depth": 1} | settings)
     roots = np.arange(1, config.variants + 1)
-    found = search(world, None, roots, candidates, config, deadline)
+    found = search(world, None, roots, candidates, config, left=left, deadline=deadline)
     assert found.pushes == world.pushes
     return found.action
 
@@ -177,6 +177,15 @@ def test_what_seems_to_win_is_tried_in_more_variants():
     rules |= {10 * v + 4: ("target_in_region" if v > 1 else "off_table", 0.0) for v in range(1, 9)}
     assert decide(World(rules), [3, 4], variants=3) == 3
     assert decide(World(rules), [3, 4], variants=8) == 4
+
+
+def test_what_a_push_promises_is_worth_nothing_after_the_last_one():
+    """Push 3 promises much, push 4 wins in half of the variants."""
+    rules = {13: ("running", 2.0), 23: ("running", 2.0), 14: ("target_in_region", 0.0), 24: ("off_table", 0.0)}
+    assert decide(World(rules), [3, 4], depth=0) == 3
+    world = World(rules)
+    assert decide(world, [3, 4], left=1) == 4
+    assert world.pushes == 4, "nothing follows the last push"
 
 
 def test_without_time_one_round_decides():

@@ -29,14 +29,13 @@ class Deliberation:
         for i in np.flatnonzero(running):
             scene, pushes, obs, joint_pos = jax.tree.map(lambda leaf, i=i: leaf[i], seen)
             if scene not in decided:  # films show a scene beside its copy
-                sight = Sight(obs, joint_pos, int(targets[i]))
-                decided[scene] = self._decide(int(scene), int(pushes), sight)
+                decided[scene] = self._decide(int(scene), Sight(obs, joint_pos, int(targets[i]), int(pushes)))
             actions[i] = decided[scene]
         return actions
 
-    def _decide(self, scene: int, pushes: int, sight: Sight) -> int:
-        key = jax.random.fold_in(jax.random.fold_in(self._key, scene), pushes)
-        memory = NOTHING if pushes == 0 else self._memories.get(scene, NOTHING)
+    def _decide(self, scene: int, sight: Sight) -> int:
+        key = jax.random.fold_in(jax.random.fold_in(self._key, scene), sight.pushes)
+        memory = NOTHING if sight.pushes == 0 else self._memories.get(scene, NOTHING)
         planned = self._planner.decide(sight, memory, key)
         self._memories[scene] = planned.memory
         return planned.action

@@ -30,11 +30,13 @@ class Sight(NamedTuple):
         obs: what the camera sees and where the hand has been sent, host arrays.
         joint_pos: [J] rad or m, the joints of the robot.
         target: slot of the target.
+        pushes: made in this episode.
     """
 
     obs: Observation
     joint_pos: np.ndarray
     target: int
+    pushes: int = 0
 
 
 class Shape(NamedTuple):

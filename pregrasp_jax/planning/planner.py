@@ -56,7 +56,7 @@ class Planner:
             config: how much is searched.
             threads: of the simulations; 0 takes every core, and decisions do not depend on it.
         """
-        self._config, self._robot = config, env.robot
+        self._config, self._robot, self._max_pushes = config, env.robot, env.task.max_pushes
         self._simulations = simulation.make_simulations(
             env.robot, env.workspace, num_variants=config.variants, threads=threads
         )
@@ -86,7 +86,8 @@ class Planner:
         scripted = self._rollout.propose(roots, script_key)[: max(_TRIED - len(proposed), 0)]
         candidates = list(dict.fromkeys([*proposed, *scripted]))
         limit = self._config.budget_ms / 1e3 if self._config.budget_ms else math.inf
-        found = search(self._rollout, bank, roots, candidates, self._config, begin + limit)
+        left = self._max_pushes - sight.pushes
+        found = search(self._rollout, bank, roots, candidates, self._config, left=left, deadline=begin + limit)
         self._seconds.append(time.perf_counter() - begin)
         self._pushes.append(found.pushes)
         return Planned(found.action, memory)

@@ -23,6 +23,9 @@ slips in one variant slips in most."""
 DISCOUNT = 0.93
 """What a success one push later is worth."""
 
+ENDS = 0.4
+"""Share of the planned episodes that end well which do so with the next push: they took 2 to 4 more."""
+
 SALVAGE = 0.6
 """Share of its promise that a state keeps after every continuation that has been tried: another can be chosen then."""
 
@@ -92,7 +95,14 @@ def chance(values: np.ndarray) -> np.ndarray:
 
 
 def search(
-    rollout: Rollout, bank: HullBank, roots: EnvState, candidates: list[int], config: PlanningConfig, deadline: float
+    rollout: Rollout,
+    bank: HullBank,
+    roots: EnvState,
+    candidates: list[int],
+    config: PlanningConfig,
+    *,
+    left: int,
+    deadline: float,
 ) -> Choice:
     """Return the candidate that does best on average over variants, by rounds in which fewer and fewer stay.
 
@@ -102,6 +112,7 @@ def search(
         roots: [V] the rebuilt scene in all variants, as host arrays.
         candidates: flat indices of Q, at least one.
         config: how deep, in how many variants.
+        left: pushes that the episode may still have, the one that is searched for included.
         deadline: by `time.perf_counter`; no round begins that would not end before it.
     """
     trees: list[list[Node]] = [[] for _ in candidates]
@@ -111,9 +122,9 @@ def search(
         if number and begin + last > deadline:
             break
         best = sorted(best, key=lambda c: -_mean_worth(trees[c]))[:keep]
-        due = [n for c in best for n in _due(trees[c], candidates[c], roots, 1 + number, config)]
+        due = [n for c in best for n in _due(trees[c], candidates[c], roots, 1 + number, config, left)]
         for nodes in _batches(due, rollout.batch):
-            _follow(rollout, bank, nodes)
+            _follow(rollout, bank, nodes, left)
         if len(best) <= GRASPED:
             _grasp(rollout, bank, [trees[c] for c in best])
         last = time.perf_counter() - begin
@@ -121,12 +132,12 @@ def search(
     return Choice(candidates[max(best, key=lambda c: _mean_worth(trees[c]))], pushes)
 
 
-def _due(trees: list[Node], action: int, roots: EnvState, count: int, config: PlanningConfig) -> list[Node]:
+def _due(trees: list[Node], action: int, roots: EnvState, count: int, config: PlanningConfig, left: int) -> list[Node]:
     """Return from where a candidate, `action`, is pushed on in a round of `count` pushes.
 
     Where nothing follows in the variants that it has been tried in, new ones join its `trees`.
     """
-    found = [_most_promising(tree, config.depth) for tree in trees]
+    found = [_most_promising(tree, min(config.depth, left - 1)) for tree in trees]
     further = [node for node in found if node is not None]
     tried = len(trees)
     for variant in range(tried, min(tried + count - len(further), config.variants)):
@@ -156,22 +167,23 @@ def _padded(nodes: list[Node], size: int) -> tuple[list[Node], np.ndarray, EnvSt
     return padded, np.arange(size) < len(nodes), states
 
 
-def _follow(rollout: Rollout, bank: HullBank, nodes: list[Node]) -> None:
-    """Try the next proposal of every node, at most a batch of them."""
+def _follow(rollout: Rollout, bank: HullBank, nodes: list[Node], left: int) -> None:
+    """Try the next proposal of every node, at most a batch of them; `left` is as in `search`."""
     padded, real, states = _padded(nodes, rollout.batch)
     actions = np.array([node.proposals[len(node.children)] for node in padded], np.int32)
     pushed = rollout.push(bank, states, actions, real)
     ends, proposals, terminated = jax.device_get((pushed.states, pushed.actions, pushed.results.terminated))
     enclosed = rollout.succeeded(pushed.results.reason)
-    chances = np.where(terminated, enclosed, DISCOUNT * chance(np.asarray(pushed.values)))
+    chances = DISCOUNT * chance(np.asarray(pushed.values))
     for i, node in enumerate(nodes):
+        in_time = 1 - (1 - ENDS) ** (left - node.depth - 1)
         safety = node.safety * float(pushed.safety[i])
         child = Node(
             state=jax.tree.map(lambda leaf, i=i: leaf[i], ends),
             proposals=[] if terminated[i] else proposals[i].tolist(),
             depth=node.depth + 1,
             safety=safety,
-            promise=float(chances[i]) * safety * DISCOUNT**node.depth,
+            promise=float(enclosed[i] if terminated[i] else in_time * chances[i]) * safety * DISCOUNT**node.depth,
             ungrasped=bool(enclosed[i]),
         )
         node.children.append(child)
