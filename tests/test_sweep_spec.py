@@ -264,12 +264,14 @@ def test_cores_memory_and_gpus_are_shared_out(monkeypatch):
             shared(**options)
 
 
-def test_the_sweep_of_the_docs_can_be_started(tmp_path):
+def test_the_sweeps_of_the_docs_can_be_started(tmp_path):
     text = (Path(__file__).parent.parent / "docs" / "sweeps.md").read_text()
-    (code,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
-    (tmp_path / "spec.yaml").write_text(code)
-    spec = read_spec(tmp_path / "spec.yaml")
-    checks.check(spec)
+    codes = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    assert len(codes) == 2
+    for code in codes:
+        (tmp_path / "spec.yaml").write_text(code)
+        spec = read_spec(tmp_path / "spec.yaml")
+        checks.check(spec)
     assert {key for key in spec.__dataclass_fields__ if f"`{key}`" in text} == set(spec.__dataclass_fields__)
 
 
