@@ -110,7 +110,7 @@ class World:
     batch = 4
 
     def __init__(self, rules: dict[int, tuple[str, float]]):
-        self.rules, self.pushes, self.calls = rules, 0, 0
+        self.rules, self.pushes, self.calls, self.grasps = rules, 0, 0, 0
 
     def push(self, bank: Any, states: np.ndarray, actions: np.ndarray, execute: np.ndarray) -> Any:
         after = 10 * states + actions
@@ -128,6 +128,7 @@ class World:
         return reason == REASONS.index("target_in_region")
 
     def grasp(self, bank: Any, states: np.ndarray, execute: np.ndarray) -> np.ndarray:
+        self.grasps += int(execute.sum())
         return execute & (states % 10 != 7)  # what ends with push 7 slips
 
 
@@ -177,6 +178,12 @@ def test_what_seems_to_win_is_tried_in_more_variants():
     rules |= {10 * v + 4: ("target_in_region" if v > 1 else "off_table", 0.0) for v in range(1, 9)}
     assert decide(World(rules), [3, 4], variants=3) == 3
     assert decide(World(rules), [3, 4], variants=8) == 4
+
+
+def test_grasps_are_tried_of_the_last_two_candidates_in_one_batch():
+    world = World({10 * v + a: ("target_in_region", 0.0) for v in range(1, 9) for a in range(3, 9)})
+    assert decide(world, list(range(3, 9)), variants=8) == 3
+    assert 0 < world.grasps <= world.batch
 
 
 def test_what_a_push_promises_is_worth_nothing_after_the_last_one():

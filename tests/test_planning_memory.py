@@ -91,6 +91,12 @@ def test_the_first_variant_is_what_was_seen_and_the_others_differ():
     mass = np.asarray(drawn[0].bank.mass).reshape(3, 8)
     assert mass[0, 0] == pytest.approx(300 * 0.15 * 0.09 * 0.05, rel=0.06)
     assert (np.abs(mass[1:, 0] / mass[0, 0] - 1) > 1e-3).all()
+    friction = np.asarray(drawn[0].bank.friction).reshape(3, 8)
+    np.testing.assert_allclose(friction[0], 0.25)
+    assert (np.abs(friction[1:] - 0.25) > 1e-4).all() and (np.abs(np.log(friction / 0.25)) <= np.log(1.4) + 1e-6).all()
+    width = np.ptp(np.asarray(drawn[0].bank.full.vertices)[:, :, :2].reshape(3, 8, -1, 2)[:, 0], axis=1)
+    assert len(np.unique(np.round(width / width[:1], 4), axis=0)) == 3, "sides differ, not sizes alone"
+    assert (np.abs(width[1:, 0] / width[0, 0] - width[1:, 1] / width[0, 1]) > 1e-4).all()
 
 
 def test_a_camera_does_not_see_the_table_behind_a_tower():

@@ -107,6 +107,28 @@ def test_sides_are_off_by_a_quarter_of_a_cell(length: float, width: float, round
     assert np.quantile(extent, 0.05) > -3e-3, "as wide as it is, or a hand that is too narrow for it seems to fit"
 
 
+@pytest.mark.parametrize(("shape", "least"), [("round", 0.9), ("square", 0.88)])
+def test_outline_has_size_and_shape_of_the_object(shape: str, least: float):
+    """Least where a square stands along the cells: each of its sides may be half a cell off."""
+    rng = np.random.default_rng(0)
+    fine = np.stack(np.meshgrid(*[np.linspace(-0.1, 0.1, 201)] * 2), axis=-1).reshape(-1, 2)
+    share, size = [], []
+    for _ in range(20):
+        centre, turn = rng.uniform(-0.05, 0.05, 2), rng.uniform(0, np.pi)
+
+        def inside(points: np.ndarray, centre: np.ndarray = centre, turn: float = turn) -> np.ndarray:
+            local = (points - centre) @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+            return np.linalg.norm(local, axis=1) < 0.035 if shape == "round" else np.abs(local).max(axis=1) < 0.03
+
+        cells, others = XY[inside(XY)], XY[~inside(XY)]
+        angle = outlines.turn_of(cells)
+        found = (fine @ directions(np.float64(angle)).T <= outlines.outline(cells, others, angle)).all(axis=1)
+        share.append((found & inside(fine)).sum() / (found | inside(fine)).sum())
+        size.append(found.sum() / inside(fine).sum())
+    assert np.mean(share) > 0.94 and min(share) > least
+    assert abs(np.mean(size) - 1) < 0.015
+
+
 def test_layers_follow_a_bottle():
     radius = np.linalg.norm(XY, axis=1)
     height = np.select([radius < 0.015, radius < 0.04], [0.25, 0.15], 0.0)  # a neck on a body
