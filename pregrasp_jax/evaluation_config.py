@@ -52,7 +52,7 @@ class PlanningConfig:
     candidates: int = 10
     """Pushes that the network proposes, 2 cm apart; scripts add to them up to 16."""
     variants: int = 8
-    """Rebuilt scenes in which a push is tried at most; all but the first have other poses, sides, masses and friction."""
+    """Most rebuilt scenes in which a push is tried; all but the first have other poses, sides, masses and friction."""
     depth: int = 2
     """Pushes of the network that may follow a candidate."""
 
