@@ -78,6 +78,9 @@ class EvaluationConfig:
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     task: TaskOverrides = field(default_factory=TaskOverrides)
     strokes: StrokesOverrides = field(default_factory=StrokesOverrides)
+    reachable: bool = False
+    """Let a trained policy take the best push that the arm can make, as `deploy` does; False takes the best of all, and
+    an episode ends by one that is out of reach, as in the paper."""
     plan: bool = False
     """Let a trained policy search in a rebuilt scene before every push."""
     planning: PlanningConfig = field(default_factory=PlanningConfig)

@@ -212,6 +212,11 @@ def test_chances_rise_with_values():
     [
         (["--policy", "clear", "--plan", "True"], "plan = True: policy clear is a script; allowed is pretrained"),
         (["--policy", "strokes", "--plan", "True"], "plan = True: policy strokes is a script; allowed is pretrained"),
+        (["--policy", "clear", "--reachable", "True"], "reachable = True: policy clear is a script; allowed is pretr"),
+        (
+            ["--policy", "pretrained", "--plan", "True", "--reachable", "True"],
+            "reachable = True: plan = True takes no push that is out of reach; allowed is one of the two",
+        ),
         (["--policy", "pretrained", "--planning.depth", "1"], "planning.* is set, but plan = False"),
         (
             ["--policy", "pretrained", "--plan", "True", "--planning.variants", "0"],

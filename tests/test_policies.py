@@ -11,7 +11,7 @@ from fake_env import ACTIONS, CLOSED, OPEN, UNREACHABLE_ROWS, FakeEnv, fake_env,
 
 from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.policies import scripts
-from pregrasp_jax.policies.learned import make_learned
+from pregrasp_jax.policies.learned import best_reachable, make_learned
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.task.rules import TARGET_IN_REGION
 from pregrasp_jax.types import REASONS, EnvState, GraspResult, Observation
@@ -102,6 +102,35 @@ def test_learned_takes_the_best_allowed_pixel(key: jax.Array) -> None:
     make = make_learned(ENV, lambda params, obs, target: params)
     chosen = make(q)(state, key)
     assert chosen == ACTIONS.encode(rows[0], cols[0], jnp.int32(OPEN))
+
+
+@pytest.mark.parametrize("p1", [(-0.1, -0.2), (-0.2, 0.0)])
+def test_the_best_reachable_push_is_the_first_of_the_best_that_the_arm_can_make(
+    p1: tuple[float, float], key: jax.Array
+) -> None:
+    """Against a loop; values fall toward larger y, so that the best ones are where the fake arm cannot go."""
+    state = _state(p1, (0.0, 0.1))
+    noise = np.random.default_rng(0).uniform(size=(100, 100, 2))
+    q = 0.3 * noise - np.arange(100)[:, None, None]
+    mask = np.asarray(ENV.action_mask(state.hand))
+    left, wanted = mask.copy(), -1
+    while wanted < 0:
+        row, col, choice = np.unravel_index(np.argmax(np.where(left, q, -np.inf)), q.shape)
+        if row >= UNREACHABLE_ROWS:
+            wanted = int(ACTIONS.encode(row, col, choice))
+        near = np.hypot(np.arange(100)[:, None] - row, np.arange(100)[None] - col) < 4
+        left[..., choice] &= ~near
+    q = jnp.asarray(q, jnp.float32)
+    best, reached = (make_learned(ENV, lambda params, *_: params, reachable=r)(q)(state, key) for r in (False, True))
+    assert reached == wanted
+    assert (best == wanted) == (p1[1] == 0.0), "only near the border is the best one out of reach"
+
+
+def test_the_best_push_is_taken_where_none_is_reachable(key: jax.Array) -> None:
+    state = _state((-0.1, -0.2475), (0.0, 0.1))
+    q = jnp.zeros((100, 100, 2)).at[0, 40, 1].set(1.0)
+    mask = ENV.action_mask(state.hand) & (jnp.arange(100) < UNREACHABLE_ROWS)[:, None, None]
+    assert best_reachable(ENV, state, q, mask) == ACTIONS.encode(0, 40, jnp.int32(OPEN))
 
 
 def test_learned_sees_its_own_target(key: jax.Array) -> None:

@@ -38,7 +38,7 @@ def _play_q(env: Env, trained: TrainedPolicy, style: str, request: EvaluationCon
     if request.plan:
         policy = Planner(env, q_function, trained.params, request.planning, threads=request.physics.threads)
     else:
-        policy = make_learned(env, q_function.values)(trained.params)
+        policy = make_learned(env, q_function.values, reachable=request.reachable)(trained.params)
     return Learned(
         policy=policy,
         q_values=lambda params, state: q_function.values(params, state.obs, state.scene.target),
@@ -47,8 +47,11 @@ def _play_q(env: Env, trained: TrainedPolicy, style: str, request: EvaluationCon
 
 
 def _play_strokes(env: Env, trained: TrainedPolicy, style: str, request: EvaluationConfig) -> Learned:
-    if request.plan:
-        raise ValueError(f"plan = True: policy {trained.origin} chooses strokes; allowed is one that chooses pushes")
+    for key in ("plan", "reachable"):
+        if getattr(request, key):
+            raise ValueError(
+                f"{key} = True: policy {trained.origin} chooses strokes; allowed is one that chooses pushes"
+            )
     strokes = trained.config.strokes
     function = StrokeFunction(strokes, env.primitive.actions)
     styles = {

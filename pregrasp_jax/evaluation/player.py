@@ -131,6 +131,7 @@ def run_evaluation(
         workspace_hash=player.env.workspace.content_hash,
         wall_seconds=time.monotonic() - start,
         planning=player.policy.describe() if isinstance(player.policy, Planner) else None,
+        reachable=request.reachable,
     )
 
 
@@ -143,9 +144,14 @@ def _named(spec: str) -> tuple[str, str]:
 
 
 def _check_planning(request: EvaluationConfig, trained: TrainedPolicy | None) -> None:
-    """Refuse a search that has no network to ask, and settings of one that is not wanted."""
-    if request.plan and trained is None:
-        raise ValueError(f"plan = True: policy {request.policy} is a script; allowed is pretrained, or a run folder")
+    """Refuse a search or a choice that has no network to ask, and settings of a search that is not wanted."""
+    for key in ("plan", "reachable"):
+        if getattr(request, key) and trained is None:
+            raise ValueError(
+                f"{key} = True: policy {request.policy} is a script; allowed is pretrained, or a run folder"
+            )
+    if request.plan and request.reachable:
+        raise ValueError("reachable = True: plan = True takes no push that is out of reach; allowed is one of the two")
     if not request.plan and request.planning != PlanningConfig():
         raise ValueError("planning.* is set, but plan = False; allowed is plan = True with it")
     request.planning.validate()

@@ -150,6 +150,7 @@ def evaluation_document(
     workspace_hash: str,
     wall_seconds: float,
     planning: Mapping[str, Any] | None = None,
+    reachable: bool = False,
 ) -> dict[str, Any]:
     """Return the content of an evaluation file (`pregrasp-jax evaluate --json`).
 
@@ -163,11 +164,13 @@ def evaluation_document(
         workspace_hash: which place; files of two places are paired only when that is asked for.
         wall_seconds: s, how long the evaluation took on this machine, compilation included.
         planning: settings of the search that decided and what it took, None without one.
+        reachable: whether pushes out of reach were passed over.
     """
     return {
         "format": FORMAT,
         "policy": policy,
         "planning": None if planning is None else dict(planning),
+        "reachable": reachable,
         "physics": config.physics.engine,
         "object_set": config.assets.object_set,
         "camera": config.task.camera,
@@ -224,6 +227,7 @@ def _damaged_keys(document: dict[str, Any]) -> list[str]:
     good["obstructions"] = isinstance(found, dict) and all(isinstance(counts, dict) for counts in found.values())
     good["rows"] = isinstance(rows, list) and len(rows) > 0 and all(map(_is_row, rows))
     good["planning"] = document.get("planning") is None or isinstance(document["planning"], dict)
+    good["reachable"] = isinstance(document.get("reachable", False), bool)
     good["config"] = isinstance(config, dict) and isinstance(config.get("task", {}), dict)
     return [key for key, is_good in good.items() if not is_good]
 

@@ -24,8 +24,15 @@ _OF_TARGET_PPG = ("strokes.free_space", "strokes.mask_radius")
 
 
 def policy_name(document: Mapping[str, Any]) -> str:
-    """Return what decided in an evaluation: a policy, or a search that asks it."""
-    return document["policy"] + (" with planning" if document.get("planning") else "")
+    """Return what decided in an evaluation: a policy, or a search or the arm's reach together with it."""
+    if document.get("planning"):
+        return document["policy"] + " with planning"
+    return document["policy"] + (", reachable" if document.get("reachable") else "")
+
+
+def decides_alone(document: Mapping[str, Any]) -> bool:
+    """Return whether a policy's best push was executed, come what may."""
+    return not document.get("planning") and not document.get("reachable")
 
 
 def is_number(value: Any) -> TypeGuard[float]:
@@ -234,6 +241,8 @@ def _differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
     for key in ("camera", "physics", "seed"):
         if a[key] != b[key]:
             yield f"{key}: {a[key]} | {b[key]}"
+    if (chosen := [bool(document.get("reachable")) for document in (a, b)])[0] != chosen[1]:
+        yield f"reachable: {chosen[0]} | {chosen[1]}"
     searches = [(document.get("planning") or {}).get("settings", {}) for document in (a, b)]
     for key in sorted(set(searches[0]) | set(searches[1])):
         if searches[0].get(key) != searches[1].get(key):

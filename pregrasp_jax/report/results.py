@@ -7,7 +7,7 @@ from typing import Any
 
 from pregrasp_jax.config import STYLES, Config, TaskConfig
 from pregrasp_jax.evaluation import load_evaluation
-from pregrasp_jax.evaluation.statistics import compare, policy_name, workspace_of
+from pregrasp_jax.evaluation.statistics import compare, decides_alone, policy_name, workspace_of
 from pregrasp_jax.report.markup import Markup, element
 from pregrasp_jax.report.record import RunRecord
 from pregrasp_jax.report.svg import interval_mark
@@ -88,7 +88,7 @@ def missing(run: RunRecord, documents: Sequence[dict[str, Any]]) -> list[tuple[s
         there = [document for document in documents if document["object_set"] == object_set]
         present = [document for document in there if workspace_of(document) == here]
         names = {document["policy"] for document in present}
-        if not any(not document.get("planning") for document in of_run(run, present)):
+        if not any(map(decides_alone, of_run(run, present))):
             lacking.append((f"this run on {object_set} objects", _command(run, str(run.path), object_set, episodes)))
         lacking += [
             (f"{name} on {object_set} objects", _command(run, name, object_set, episodes))
@@ -144,7 +144,7 @@ def _row(run: RunRecord, document: dict[str, Any], of_this_run: Sequence[dict[st
         f"{percent(low)} to {percent(high)}",
         interval_mark(document["success_rate"], low, high),
         _motions(document),
-        "" if own and not document.get("planning") else _paired(of_this_run, document),
+        "" if own and decides_alone(document) else _paired(of_this_run, document),
     ]
     return element(
         "tr", element("th", name, scope="row"), *(element("td", cell) for cell in cells), class_="own" if own else None
@@ -174,6 +174,6 @@ def _paired(of_this_run: Sequence[dict[str, Any]], other: dict[str, Any]) -> str
 
 def _rank(run: RunRecord, document: dict[str, Any]) -> tuple[int, bool, str]:
     if is_of_run(run, document):
-        return 0, bool(document.get("planning")), document["camera"]
+        return 0, not decides_alone(document), document["camera"]
     policy = document["policy"]
     return (1 + BASELINES.index(policy) if policy in BASELINES else 1 + len(BASELINES)), False, policy
