@@ -27,7 +27,7 @@ RTOL, ATOL = 1e-3, 1e-5
 
 def _environment(*, devices: int) -> dict[str, str]:
     """Return the environment of a process with so many devices."""
-    flags = f"--xla_force_host_platform_device_count={devices}"
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
     folders = os.pathsep.join(map(str, (SCRIPT.parent.parent, SCRIPT.parent)))
     return os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "NPROC": "4", "PYTHONPATH": folders}
 
