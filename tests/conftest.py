@@ -74,12 +74,8 @@ def key() -> jax.Array:
 
 @pytest.fixture(scope="module", autouse=True)
 def optimise(request: pytest.FixtureRequest) -> Generator[None]:
-    """Let some modules compile as everybody does.
-
-    Hundreds of steps of `mjx`, or millions of draws, take longer than what is saved; and in sensors, two programs have
-    to round alike.
-    """
-    if not request.path.name.startswith(("test_exploration", "test_sensor")):
+    """Let a module compile as everybody does: millions of draws take longer than what is saved."""
+    if not request.path.name.startswith("test_exploration"):
         yield
         return
     before = jax.config.read("jax_disable_most_optimizations")

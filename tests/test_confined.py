@@ -141,8 +141,8 @@ def obstructions():
     """What is in the way of pushes from the start, after one to a first cell: (posture, first, second) -> codes."""
     push = make_push(ROBOT, SHELF, TaskConfig(), max_distance=0.6)
     rng = np.random.default_rng(0)
-    rows, cols = rng.integers(0, grid.GRID_SIZE, 150), rng.integers(0, grid.GRID_SIZE, 150)
-    actions = push.actions.encode(jnp.asarray(rows), jnp.asarray(cols), jnp.asarray(rng.integers(0, 2, 150)))
+    rows, cols = rng.integers(0, grid.GRID_SIZE, 300), rng.integers(0, grid.GRID_SIZE, 300)
+    actions = push.actions.encode(jnp.asarray(rows), jnp.asarray(cols), jnp.asarray(rng.integers(0, 2, 300)))
     start = jax.tree.map(jnp.asarray, ROBOT.start)
 
     @jax.jit
@@ -158,9 +158,9 @@ def test_between_walls_the_mirrored_push_of_the_mirrored_arm_meets_the_same(obst
     here = np.asarray(code(drawn, jnp.broadcast_to(jnp.asarray(ROBOT.homes[0]), (len(drawn), 8))))
     there = np.asarray(code(actions.mirror(drawn), jnp.broadcast_to(jnp.asarray(ROBOT.homes[1]), (len(drawn), 8))))
     same_arm = np.asarray(code(actions.mirror(drawn), jnp.broadcast_to(jnp.asarray(ROBOT.homes[0]), (len(drawn), 8))))
-    assert (here == WALL).sum() > 15 and (here == NONE).sum() > 50
+    assert (here == WALL).sum() > 30 and (here == NONE).sum() > 100
     assert (here != there).sum() <= 1, "up to rounding at the margin"
-    assert (here != same_arm).sum() > 5, "the wrist is on one side"
+    assert (here != same_arm).sum() > 10, "the wrist is on one side"
 
 
 # -- Clearance along a motion

@@ -13,8 +13,10 @@ import pytest
 from fake_env import ACTIONS, OPEN, FakeEnv, fake_env, make_scenes
 from jax.tree_util import Partial
 
+from pregrasp_jax.cli.main import main
 from pregrasp_jax.config import Config, SceneConfig, TaskConfig
 from pregrasp_jax.evaluation import Episode, EvaluationResult, Evaluator, evaluate_policy, results
+from pregrasp_jax.evaluation.statistics import compare, decides_alone
 from pregrasp_jax.policies import scripts
 from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.task.assembly import make_env
@@ -207,7 +209,7 @@ RESULT = EvaluationResult(
 )
 
 
-def _document(result: EvaluationResult = RESULT, policy: str = "clear") -> dict:
+def _document(result: EvaluationResult = RESULT, policy: str = "clear", **fields: Any) -> dict:
     return results.evaluation_document(
         result,
         policy=policy,
@@ -217,7 +219,31 @@ def _document(result: EvaluationResult = RESULT, policy: str = "clear") -> dict:
         scene_bank_hash="s",
         workspace_hash="w",
         wall_seconds=12.34,
+        **fields,
     )
+
+
+def test_files_and_comparisons_say_that_pushes_out_of_reach_were_passed_over(tmp_path: Path) -> None:
+    reached, plain = _document(policy="run", reachable=True), _document(policy="run")
+    assert (reached["reachable"], plain["reachable"]) == (True, False)
+    assert not decides_alone(reached) and decides_alone(plain)
+    assert results.format_evaluation(reached).startswith("run, reachable on 5 seen scenes")
+    found = compare(reached, plain)
+    assert found.policies == ("run, reachable", "run") and found.settings == ("reachable: True | False",)
+    (tmp_path / "e.json").write_text(json.dumps(reached | {"reachable": "yes"}))
+    with pytest.raises(ValueError, match=r"damaged evaluation \(reachable\)"):
+        results.load_evaluation(tmp_path / "e.json")
+
+
+@pytest.mark.slow
+def test_a_policy_that_takes_reachable_pushes_is_refused_none_by_a_wall(tmp_path: Path) -> None:
+    """`pretrained` ends its first and its third scene in the shelf by a push that a wall forbids."""
+    files = {reachable: tmp_path / f"{reachable}.json" for reachable in ("True", "False")}
+    for reachable, file in files.items():
+        arguments = ["--policy", "pretrained", "--workspace", "shelf", "--episodes", "3", "--reachable", reachable]
+        assert main(["evaluate", *arguments, "--json", str(file)]) == 0
+    walls = {r: [row["obstruction"] == "wall" for row in json.loads(f.read_text())["rows"]] for r, f in files.items()}
+    assert walls == {"True": [False] * 3, "False": [True, False, True]}
 
 
 def test_an_attempt_may_be_two_motions_and_a_target_held_in_any_way() -> None:
