@@ -15,6 +15,8 @@ from pathlib import Path
 import jax
 import pytest
 
+gc.disable()  # until everything is imported
+
 MAX_MB = 2048
 """Resident memory that a worker may have; compiling the push of `mjx` and remeshing by CoACD take nearly as much."""
 
@@ -65,6 +67,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest modules first; the others stay in order."""
     places = {name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST)))
+
+
+def pytest_collection_finish() -> None:
+    """Leave what was imported out of every later collection of garbage, of which there is one after each module."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture
