@@ -213,6 +213,8 @@ def test_chances_rise_with_values():
         (["--policy", "clear", "--plan", "True"], "plan = True: policy clear is a script; allowed is pretrained"),
         (["--policy", "strokes", "--plan", "True"], "plan = True: policy strokes is a script; allowed is pretrained"),
         (["--policy", "clear", "--reachable", "True"], "reachable = True: policy clear is a script; allowed is pretr"),
+        (["--policy", "ppg", "--reachable", "True"], "reachable = True: policy ppg chooses strokes; allowed is pretr"),
+        (["--policy", "target-ppg", "--plan", "True"], "plan = True: policy target-ppg chooses strokes; allowed is pr"),
         (
             ["--policy", "pretrained", "--plan", "True", "--reachable", "True"],
             "reachable = True: plan = True takes no push that is out of reach; allowed is one of the two",

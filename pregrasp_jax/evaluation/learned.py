@@ -47,11 +47,6 @@ def _play_q(env: Env, trained: TrainedPolicy, style: str, request: EvaluationCon
 
 
 def _play_strokes(env: Env, trained: TrainedPolicy, style: str, request: EvaluationConfig) -> Learned:
-    for key in ("plan", "reachable"):
-        if getattr(request, key):
-            raise ValueError(
-                f"{key} = True: policy {trained.origin} chooses strokes; allowed is one that chooses pushes"
-            )
     strokes = trained.config.strokes
     function = StrokeFunction(strokes, env.primitive.actions)
     styles = {

@@ -146,9 +146,10 @@ def _named(spec: str) -> tuple[str, str]:
 def _check_planning(request: EvaluationConfig, trained: TrainedPolicy | None) -> None:
     """Refuse a search or a choice that has no network to ask, and settings of a search that is not wanted."""
     for key in ("plan", "reachable"):
-        if getattr(request, key) and trained is None:
+        if getattr(request, key) and (trained is None or trained.config.train.method == "imitation"):
+            kind = "is a script" if trained is None else "chooses strokes"
             raise ValueError(
-                f"{key} = True: policy {request.policy} is a script; allowed is pretrained, or a run folder"
+                f"{key} = True: policy {request.policy} {kind}; allowed is pretrained, or a run that learned pushes"
             )
     if request.plan and request.reachable:
         raise ValueError("reachable = True: plan = True takes no push that is out of reach; allowed is one of the two")
