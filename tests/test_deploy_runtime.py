@@ -13,7 +13,7 @@ from bundles import SMALL, small_bundle
 
 from pregrasp_jax import heightmap
 from pregrasp_jax.config import TaskConfig
-from pregrasp_jax.deploy.decision import Decider, allowed_pushes, workspace_of
+from pregrasp_jax.deploy.decision import Decider, action_space, allowed_pushes, workspace_of
 from pregrasp_jax.deploy.policy import load_values
 from pregrasp_jax.deploy.projection import Maps, draw_robot, project, to_maps
 from pregrasp_jax.geometry import rigid_inverse
@@ -234,6 +234,29 @@ def test_a_push_that_the_arm_cannot_make_is_passed_over(decider: Decider):
     other = fenced.decide(golden_maps(0), decider.start(), joints_of(0))
     assert other.push is not None and other.push.action != best.action
     assert other.refused[0] == (best.action, "wall")
+    space = action_space(SMALL.bundle.contract.action)
+    tried = [action for action, _ in other.refused] + [other.push.action]
+    ends, choices = space.decode(np.array(tried))
+    apart = np.linalg.norm(ends[:, None] - ends, axis=-1) + (choices[:, None] != choices) + np.eye(len(tried))
+    assert apart.min() > 0.02 - 1e-6, "what lies near to a refused push is not tried"
+    assert other.q is not None
+    left = other.allowed & ~np.any([space.near(action, 0.02) for action in tried[:-1]], axis=0)
+    assert other.push.action == np.argmax(np.where(left, other.q, -np.inf)), "the best of the rest"
+
+
+def test_where_the_arm_can_make_no_push_none_is_left(decider: Decider, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("pregrasp_jax.deploy.decision._obstruction", lambda _: "wall")
+    found = decider.decide(golden_maps(0), decider.start(), joints_of(0))
+    assert found.push is None and 20 < len(found.refused) < 400
+    space = action_space(SMALL.bundle.contract.action)
+    covered = np.any([space.near(action, 0.02) for action, _ in found.refused], axis=0)
+    assert covered[found.allowed].all()
+
+
+def test_a_value_that_is_no_number_decides_nothing(decider: Decider):
+    nowhere = dataclasses.replace(decider, values=lambda *maps: np.full_like(decider.values(*maps), np.nan))
+    found = nowhere.decide(golden_maps(0), decider.start(), joints_of(0))
+    assert found.push is None and not found.close and not found.refused
 
 
 def test_the_fingers_close_on_a_target_between_them(decider: Decider):

@@ -14,14 +14,11 @@ from pregrasp_jax.robot import kinematics
 from pregrasp_jax.robot.following import Body, Followed, follow
 from pregrasp_jax.robot.region import ClosingRegion
 from pregrasp_jax.spaces import grid, motion
-from pregrasp_jax.spaces.actions import ActionSpace, Choice
+from pregrasp_jax.spaces.actions import REFUSED_RADIUS, ActionSpace, Choice
 from pregrasp_jax.spaces.workspace import Box, Workspace
 
 DT = 0.02
 """s between poses along a push."""
-
-MAX_TRIED = 1000
-"""Best pushes that are tried before there is no reachable one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,16 +171,18 @@ class Decider:
     def _best(
         self, q: np.ndarray, allowed: np.ndarray, hand: motion.Held, joint_pos: np.ndarray
     ) -> tuple[Push | None, tuple[tuple[int, str], ...]]:
-        """Return the best push that the arm can make, and the better ones that it cannot."""
-        flat = np.where(allowed, q, -np.inf).ravel()
-        refused = []
-        for action in np.argsort(-flat, kind="stable")[:MAX_TRIED]:
-            if not np.isfinite(flat[action]):
-                break
-            push, obstruction = self.plan(int(action), float(flat[action]), hand, joint_pos)
+        """Return the best push that the arm can make, and the better ones that it cannot.
+
+        Those near to a refused one are left out, as in `policies.learned.best_reachable`.
+        """
+        space, left, refused = action_space(self.contract.action), allowed & np.isfinite(q), []
+        while left.any():
+            action = int(np.argmax(np.where(left, q, -np.inf)))
+            push, obstruction = self.plan(action, float(q.flat[action]), hand, joint_pos)
             if not obstruction:
                 return push, tuple(refused)
-            refused.append((int(action), obstruction))
+            refused.append((action, obstruction))
+            left = left & ~space.near(action, REFUSED_RADIUS)
         return None, tuple(refused)
 
 

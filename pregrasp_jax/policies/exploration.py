@@ -97,18 +97,9 @@ def best_apart(q: jax.Array, mask: jax.Array, actions: ActionSpace, *, count: in
     def take(left: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
         left = jnp.where(jnp.any(left), left, mask)
         action = jnp.argmax(jnp.where(left, q, -jnp.inf)).astype(jnp.int32)
-        return left & ~near(action, actions, radius=spacing), action
+        return left & ~actions.near(action, spacing), action
 
     return jax.lax.scan(take, mask, None, length=count)[1]
-
-
-def near(action: jax.Array, actions: ActionSpace, *, radius: float) -> jax.Array:
-    """Return which pushes [H, W, K] bool end less than `radius` m from where `action` does, held in the same way."""
-    row, col, choice = actions.unravel(action)
-    cells, choices = jnp.arange(grid.GRID_SIZE), jnp.arange(actions.num_choices)
-    squared = (cells[:, None] - row) ** 2 + (cells[None] - col) ** 2
-    within = squared < (radius / grid.HEIGHTMAP_RESOLUTION) ** 2 - 1e-3
-    return within[..., None] & (choices == choice)[None, None]
 
 
 def random_action(key: jax.Array, mask: jax.Array, actions: ActionSpace) -> jax.Array:

@@ -8,13 +8,10 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from pregrasp_jax.learning.learner import greedy_action
-from pregrasp_jax.policies import exploration
 from pregrasp_jax.policies.scripts import Policy
+from pregrasp_jax.spaces.actions import REFUSED_RADIUS
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.types import EnvState, Observation
-
-_APART = 0.02
-"""m; so near to a push that a wall forbids no other one is tried."""
 
 
 def make_learned(
@@ -57,7 +54,7 @@ def best_reachable(env: Env, state: EnvState, q: jax.Array, mask: jax.Array) -> 
 
     def next_best(tried: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         left, action = tried
-        left = left & ~exploration.near(action, actions, radius=_APART)
+        left = left & ~actions.near(action, REFUSED_RADIUS)
         return left, greedy_action(q, left)
 
     def goes_on(tried: tuple[jax.Array, jax.Array]) -> jax.Array:

@@ -12,6 +12,9 @@ import numpy as np
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.arrays import namespace
 
+REFUSED_RADIUS = 0.02
+"""m; so near to a push that the arm cannot make, no other one is tried."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
@@ -110,6 +113,14 @@ class ActionSpace:
         """Return the centre [..., 2] m of the cell of a flat index, and its choice."""
         row, col, choice = self.unravel(action)
         return grid.cell_to_world(row, col), choice
+
+    def near(self, action: Any, radius: float) -> Any:
+        """Return which pushes [H, W, K] bool end less than `radius` m from where `action` does, held as it is."""
+        row, col, choice = self.unravel(action)
+        cells, choices = np.arange(grid.GRID_SIZE), np.arange(self.num_choices)
+        squared = (cells[:, None] - row) ** 2 + (cells[None] - col) ** 2
+        within = squared < (radius / grid.HEIGHTMAP_RESOLUTION) ** 2 - 1e-3
+        return within[..., None] & (choices == choice)[None, None]
 
     def mirror(self, action: Any) -> Any:
         """Return the flat index of a push reflected in the robot's plane y = 0."""
