@@ -264,6 +264,9 @@ class TrainConfig:
     try_grasps: bool = False
     """Grasp whatever a push has enclosed, and reward only what the grasp holds. The paper rewards the enclosure; in the
     shelf one grasp in ten fails (docs/confined.md)."""
+    tight_targets: float = 1.0
+    """How many times likelier than one that fits between the fingers at every yaw an object that fits at hardly any
+    becomes the target of a training scene; linear in the share of yaws. The paper draws evenly."""
     tensorboard: bool = False
     """Write the same numbers for TensorBoard, into the run folder (needs the extra `tensorboard`)."""
     fused_iterations: int | None = None

@@ -59,6 +59,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "train.episodes": (1, 1_000_000_000),
     "train.env_steps": (0, 1_000_000_000),
     "train.minutes": (0.0, 1e6),
+    "train.tight_targets": (1.0, 100.0),
     "train.checkpoint_minutes": (0.0, 1e6),
     "train.evaluate_every": (0, 1_000_000_000),
     "train.log_every": (1, 1_000_000_000),

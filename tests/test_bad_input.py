@@ -56,6 +56,10 @@ COMMAND_LINES = [
         "train.try_grasps = True is not known to train.method = imitation; allowed is False",
     ),
     (
+        "train ppg --run-dir {w}/new --train.tight-targets 3",
+        "train.tight_targets = 3 is not known to train.method = imitation; allowed is 1",
+    ),
+    (
         "pregrasp_jax dokter",
         "Unrecognized options: dokter (Available subcommands: assets, calibrate-check, compare, contract, ",
         "scenes, show, sweep, train, verify)",

@@ -14,7 +14,7 @@ from test_env import ROBOT, START, unstack
 
 from pregrasp_jax.assets.bank import select
 from pregrasp_jax.assets.catalogue import builtin_bank
-from pregrasp_jax.config import Config, ExplorationConfig, SceneConfig, TaskConfig
+from pregrasp_jax.config import Config, ExplorationConfig, SceneConfig, TaskConfig, TrainConfig
 from pregrasp_jax.spaces.workspace import Box, Workspace
 from pregrasp_jax.task import assembly
 from pregrasp_jax.task.assembly import make_env
@@ -70,6 +70,33 @@ def test_reset_draws_scene_yaw_and_eligible_target(choosy, resets):
     assert targets == {(int(i), int(j)) for i, j in np.argwhere(eligible)}, "every eligible target, and no other"
     assert (scenes.object_ids < 0).any()
     assert set(np.floor(np.array(yaws) / (np.pi / 4))) == set(range(-4, 4)), "yaws are drawn from the whole circle"
+
+
+def test_tight_targets_are_drawn_as_often_as_they_weigh(env):
+    """Of the built-in objects four fit at some yaws only; nothing but the training's resets draws by weights."""
+    config = Config(scene=SceneConfig(train_scenes=3, test_scenes=3), train=TrainConfig(tight_targets=5.0))
+    weighed = make_env(config, split="train")
+    weights = weighed.target_weights
+    assert weights is not None and make_env(config, split="test").target_weights is None
+    tight = [name for name, weight in zip(NAMES, weights, strict=True) if 1.01 < weight < 4.99]
+    assert tight == ["ycb_mug_tall", "ycb_wood_block", "ycb_bleach_cleanser"]
+    ids = np.array([NAMES.index(name) for name in ("ycb_pitcher", "ycb_wood_block", "kit_jam_jar", *tight[:1])])
+    ids = jnp.asarray(np.append(ids, np.full(MAX_OBJECTS - len(ids), -1)), jnp.int32)
+    keys = jax.random.split(jax.random.key(3), 4000)
+    drawn = np.bincount(jax.jit(jax.vmap(weighed.draw_target, (0, None)))(keys, ids), minlength=MAX_OBJECTS) / 4000
+    wanted = weights[ids] * weighed.eligible[ids] * (np.asarray(ids) >= 0)
+    np.testing.assert_allclose(drawn, wanted / wanted.sum(), atol=0.03)
+    assert drawn[0] == 0, "a pitcher is no target, whatever it weighs"
+    even = np.bincount(jax.jit(jax.vmap(env.draw_target, (0, None)))(keys, ids), minlength=MAX_OBJECTS) / 4000
+    np.testing.assert_allclose(even[1:4], 1 / 3, atol=0.03)
+
+
+def test_a_hand_without_a_closing_region_has_no_tight_targets(env):
+    handless = dataclasses.replace(env, robot=dataclasses.replace(env.robot, closing_region=None))
+    with pytest.raises(
+        ValueError, match=r"tight_targets = 5: the hand of robot ur5e_rg2 has no closing region; allowed"
+    ):
+        assembly._target_weights(handless, 5.0)
 
 
 def test_reset_is_a_function_of_its_key(resets):

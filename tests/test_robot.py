@@ -8,9 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 import shapely
+import shapely.affinity
 from scipy.spatial.transform import Rotation
 
 from pregrasp_jax.assets.bank import ConvexObject, make_bank
+from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.robot import clearance, closing_region, description, get_robot
 from pregrasp_jax.robot.kinematics import hand_inverse_kinematics
 from pregrasp_jax.robot.links import CAPSULE_ERROR
@@ -359,6 +361,24 @@ def test_coverage_is_shapelys(bank):
     found, wanted = np.concatenate(found), np.concatenate(wanted)
     np.testing.assert_allclose(found, wanted, atol=0.004)
     assert (wanted == 0).any() and (wanted > 0.9).any() and ((wanted > 0.2) & (wanted < 0.8)).any()
+
+
+def test_the_share_of_fitting_yaws_is_shapelys():
+    """Every object flush against the palm, centred between the fingers, at every tenth degree."""
+    bank, (low, high) = builtin_bank("seen"), bounds()
+    found = closing_region.fitting_yaws(bank, REGION)
+    for index in range(len(bank.names)):
+        hulls = np.asarray(bank.object_hulls)[index]
+        points = np.asarray(bank.full.vertices)[hulls[hulls >= 0]][..., :2]
+        fits = []
+        for yaw in np.radians(np.arange(0, 360, 10)):
+            turned = points @ np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+            shape = shapely.union_all([shapely.MultiPoint(hull).convex_hull for hull in turned])
+            left, bottom, _, top = shape.bounds
+            moved = shapely.affinity.translate(shape, low[0] - left, -(bottom + top) / 2)
+            fits.append(moved.intersection(shapely.box(*low, *high)).area / shape.area > 0.97)
+        assert found[index] == pytest.approx(np.mean(fits), abs=0.06), bank.names[index]
+    assert ((found > 0.1) & (found < 0.9)).sum() >= 3 and (found == 1).any()
 
 
 def test_coverage_by_hand(bank):

@@ -139,6 +139,21 @@ def best_coverage(cells: np.ndarray, outline: np.ndarray, region: ClosingRegion,
     return best
 
 
+def fitting_yaws(bank: HullBank, region: ClosingRegion) -> np.ndarray:
+    """Return the share [N] float32 of all yaws at which each object fits into the region, as in `best_coverage`.
+
+    Args:
+        bank: host hull bank.
+        region: of the open hand.
+    """
+    yaw = np.arange(0, _NUM_YAWS, 4) * (2 * np.pi / _NUM_YAWS)
+    shares = []
+    for index in range(len(bank.names)):
+        cells, outline = projection(bank, index)
+        shares.append(np.mean(_coverage_at(yaw, cells[::8], outline, region) > MIN_TARGET_COVERAGE))
+    return np.array(shares, np.float32)
+
+
 def _coverage_at(yaw: np.ndarray, cells: np.ndarray, outline: np.ndarray, region: ClosingRegion) -> np.ndarray:
     """Return the share [Y] of the cells that lie in the region at each yaw [Y] rad; see `best_coverage`."""
     stations, half_width = np.asarray(region.x, np.float64), np.asarray(region.half_width, np.float64)

@@ -12,7 +12,7 @@ from pregrasp_jax.assets.sets import load_bank_for
 from pregrasp_jax.assets.variants import MakingProgress, variant_bank
 from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.physics import make_engine
-from pregrasp_jax.robot import get_robot
+from pregrasp_jax.robot import closing_region, get_robot
 from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.bank import SPLITS, SceneBank, Split
@@ -57,7 +57,19 @@ def make_env(
     refuse_scenes(place_of(config.task), scenes)
     env = assemble(config, bank, scenes, eligible=eligible, threads=threads)
     refuse_blocked(env.robot, env.workspace, env.primitive, mirrored=config.task.mirrored_start)
+    if split == "train" and config.train.tight_targets != 1:
+        return dataclasses.replace(env, target_weights=_target_weights(env, config.train.tight_targets))
     return env
+
+
+def _target_weights(env: Env, tight: float) -> np.ndarray:
+    """Return how likely objects [N] become targets; see `TrainConfig.tight_targets`."""
+    if env.robot.closing_region is None:
+        raise ValueError(
+            f"train.tight_targets = {tight:g}: the hand of robot {env.robot.name} has no closing region; allowed is 1"
+        )
+    region = jax.device_get(env.robot.closing_region(env.robot.start.aperture))
+    return tight + (1 - tight) * closing_region.fitting_yaws(env.bank, region)
 
 
 def load_split_bank(config: Config, split: Split, *, making: MakingProgress | None = None) -> HullBank:

@@ -57,6 +57,7 @@ class Env:
         max_distance: m, longest push that is planned.
         sensor: what the pinhole camera and the masks get wrong.
         num_variants: of every object in the bank, which differ in mass and friction; an episode draws among them.
+        target_weights: [N] > 0, how likely they become the target of a random scene, a host array; None draws evenly.
     """
 
     task: TaskConfig
@@ -71,6 +72,7 @@ class Env:
     max_distance: float
     sensor: Sensor = CLEAN
     num_variants: int = 1
+    target_weights: np.ndarray | None = None
 
     @property
     def symmetric(self) -> bool:
@@ -87,8 +89,12 @@ class Env:
         index = jax.random.randint(scene_key, (), 0, len(self.scenes))
         yaw = jax.random.uniform(yaw_key, minval=-jnp.pi, maxval=jnp.pi)
         object_ids = jnp.asarray(self.scenes.object_ids)[index]
-        target = jax.random.categorical(target_key, jnp.where(self.eligible_slots(object_ids), 0.0, -jnp.inf))
-        return self.start(self._scene(index, yaw, target), index)
+        return self.start(self._scene(index, yaw, self.draw_target(target_key, object_ids)), index)
+
+    def draw_target(self, key: jax.Array, object_ids: jax.Array) -> jax.Array:
+        """Return the slot () int32 of a random eligible target among object ids [MAX_OBJECTS]."""
+        logits = 0.0 if self.target_weights is None else jnp.log(jnp.asarray(self.target_weights))[object_ids]
+        return jax.random.categorical(key, jnp.where(self.eligible_slots(object_ids), logits, -jnp.inf))
 
     def reset_to(self, index: jax.Array) -> EnvState:
         """Return scene `index` of the bank with its own yaw and target."""

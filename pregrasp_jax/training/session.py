@@ -184,6 +184,8 @@ def _imitate(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
         raise ValueError("--init-from is not known to train.method = imitation; allowed is to leave it out")
     if config.train.try_grasps:
         raise ValueError("train.try_grasps = True is not known to train.method = imitation; allowed is False")
+    if (tight := config.train.tight_targets) != 1:
+        raise ValueError(f"train.tight_targets = {tight:g} is not known to train.method = imitation; allowed is 1")
     resumed = folder is not None
     env = own_protocol(_load(config, "train", console))
     folder = folder or _create(run_dir, config)
