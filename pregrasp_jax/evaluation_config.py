@@ -49,9 +49,9 @@ class PlanningConfig:
 
     budget_ms: float = 0.0
     """ms for a decision: no round of simulations begins that would exceed it. 0 sets no limit, and results repeat."""
-    candidates: int = 10
+    candidates: int = 8
     """Pushes that the network proposes, 2 cm apart; scripts add to them up to 16."""
-    variants: int = 8
+    variants: int = 6
     """Most rebuilt scenes in which a push is tried; all but the first have other poses, sides, masses and friction."""
     depth: int = 2
     """Pushes of the network that may follow a candidate."""

@@ -180,10 +180,39 @@ def test_what_seems_to_win_is_tried_in_more_variants():
     assert decide(World(rules), [3, 4], variants=8) == 4
 
 
-def test_grasps_are_tried_of_the_last_two_candidates_in_one_batch():
-    world = World({10 * v + a: ("target_in_region", 0.0) for v in range(1, 9) for a in range(3, 9)})
-    assert decide(world, list(range(3, 9)), variants=8) == 3
-    assert 0 < world.grasps <= world.batch
+def test_grasps_are_tried_where_they_can_decide():
+    """Of two that enclose alike the first holds in all six scenes; or it slips in the first, and the second holds."""
+    enclosed = {10 * v + a: ("target_in_region", 0.0) for v in range(1, 9) for a in (3, 4, 7)}
+    for candidates, grasps in (([3, 4], 6), ([7, 3], 1 + 6)):
+        world = World(enclosed)
+        assert decide(world, candidates, variants=6) == 3
+        assert world.grasps == grasps
+    alone = World(enclosed | {10 * v + 5: ("running", 1.2) for v in range(1, 9)})
+    assert decide(alone, [7, 5], depth=0) == 7 and alone.grasps == 0, "better than the other, even if it slips"
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_choice_is_that_of_trying_every_grasp(seed):
+    """Made-up scenes in which a third of what is enclosed slips, whatever the push."""
+    rng = np.random.default_rng(seed)
+    names = ["target_in_region", "running", "off_table"]
+    rules = {10 * v + a: (str(rng.choice(names, p=[0.7, 0.2, 0.1])), 1.4) for v in range(1, 9) for a in range(1, 9)}
+    slips = {state for state in range(10_000) if rng.random() < 0.3}
+    chosen = []
+    for every in (False, True):
+        world = World(rules)
+        world.grasp = lambda bank, states, execute: execute & np.array([int(s) not in slips for s in states])
+        with pytest.MonkeyPatch.context() as patch:
+            if every:
+                patch.setattr(searching, "_grasp_leader", grasp_all)
+            chosen.append(decide(world, [3, 4, 5, 6], variants=6))
+    assert chosen[0] == chosen[1]
+
+
+def grasp_all(rollout: Any, bank: Any, best: list[list[Any]]) -> None:
+    for node in (node for trees in best for tree in trees for node in tree.nodes() if node.ungrasped):
+        node.ungrasped = False
+        node.promise *= 1.0 if rollout.grasp(bank, np.array([node.state]), np.array([True]))[0] else searching.SLIPPED
 
 
 def test_what_a_push_promises_is_worth_nothing_after_the_last_one():

@@ -21,10 +21,10 @@ from pregrasp_jax.settings import to_dict
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.types import MAX_OBJECTS, EnvState, HullBank
 
-BATCH = 8
+BATCH = 6
 """Pushes simulated at a time: what pads a batch is drawn and valued for nothing."""
 
-_TRIED = 16
+_TRIED = 12
 """Candidates with those of scripts."""
 
 _APART = 4

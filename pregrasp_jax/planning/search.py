@@ -9,16 +9,16 @@ import jax
 import numpy as np
 
 from pregrasp_jax.evaluation_config import PlanningConfig
-from pregrasp_jax.planning.rollout import Rollout
+from pregrasp_jax.planning.rollout import Pushed, Rollout
 from pregrasp_jax.types import EnvState, HullBank
 
-ROUNDS = (8, 4, 2)
+ROUNDS = (3, 2)
 """Candidates that stay for the second round and those after it. Round n makes n pushes for each of them: one more in
 every variant where something may follow, and the others in new variants."""
 
 GRASPED = 2
-"""Candidates whose grasps are tried, one batch in all: it takes long, nearly all that is enclosed is held, and what
-slips in one variant slips in most."""
+"""Candidates that are left when grasps are tried: it takes long, nearly all that is enclosed is held, and what slips in
+one variant slips in most."""
 
 DISCOUNT = 0.93
 """What a success one push later is worth."""
@@ -123,10 +123,12 @@ def search(
             break
         best = sorted(best, key=lambda c: -_mean_worth(trees[c]))[:keep]
         due = [n for c in best for n in _due(trees[c], candidates[c], roots, 1 + number, config, left)]
-        for nodes in _batches(due, rollout.batch):
-            _follow(rollout, bank, nodes, left)
+        batches = _batches(due, rollout.batch)
+        # All are under way before the first is looked at: its pictures are drawn while the next is pushed.
+        for nodes, pushed in zip(batches, [_push(rollout, bank, nodes) for nodes in batches], strict=True):
+            _grow(rollout, nodes, pushed, left)
         if len(best) <= GRASPED:
-            _grasp(rollout, bank, [trees[c] for c in best])
+            _grasp_leader(rollout, bank, [trees[c] for c in best])
         last = time.perf_counter() - begin
     pushes = sum(node.depth > 0 for of_candidate in trees for tree in of_candidate for node in tree.nodes())
     return Choice(candidates[max(best, key=lambda c: _mean_worth(trees[c]))], pushes)
@@ -167,11 +169,15 @@ def _padded(nodes: list[Node], size: int) -> tuple[list[Node], np.ndarray, EnvSt
     return padded, np.arange(size) < len(nodes), states
 
 
-def _follow(rollout: Rollout, bank: HullBank, nodes: list[Node], left: int) -> None:
-    """Try the next proposal of every node, at most a batch of them; `left` is as in `search`."""
+def _push(rollout: Rollout, bank: HullBank, nodes: list[Node]) -> Pushed:
+    """Try the next proposal of every node, at most a batch of them."""
     padded, real, states = _padded(nodes, rollout.batch)
     actions = np.array([node.proposals[len(node.children)] for node in padded], np.int32)
-    pushed = rollout.push(bank, states, actions, real)
+    return rollout.push(bank, states, actions, real)
+
+
+def _grow(rollout: Rollout, nodes: list[Node], pushed: Pushed, left: int) -> None:
+    """Append to every node where its push has led; `left` is as in `search`."""
     ends, proposals, terminated = jax.device_get((pushed.states, pushed.actions, pushed.results.terminated))
     enclosed = rollout.succeeded(pushed.results.reason)
     chances = DISCOUNT * chance(np.asarray(pushed.values))
@@ -189,13 +195,18 @@ def _follow(rollout: Rollout, bank: HullBank, nodes: list[Node], left: int) -> N
         node.children.append(child)
 
 
-def _grasp(rollout: Rollout, bank: HullBank, best: list[list[Node]]) -> None:
-    """Try the grasps of the candidates that are left, given by their trees; each gets its share of one batch."""
-    enclosing = ([node for tree in trees for node in tree.nodes() if node.ungrasped] for trees in best)
-    nodes = [node for found in enclosing for node in found[: rollout.batch // GRASPED]]
-    if not nodes:
-        return
-    _, real, states = _padded(nodes, rollout.batch)
-    for node, holds in zip(nodes, rollout.grasp(bank, states, real), strict=False):
-        node.ungrasped = False
-        node.promise *= 1.0 if holds else SLIPPED
+def _grasp_leader(rollout: Rollout, bank: HullBank, best: list[list[Node]]) -> None:
+    """Try the grasps of the candidate that leads, of those given by their trees, unless it would lead if they slipped.
+
+    So on for whoever leads then: the one chosen in the end is the one that trying all grasps would choose.
+    """
+    for _ in best:
+        leader, *others = sorted(best, key=_mean_worth, reverse=True)
+        rival = max(map(_mean_worth, others), default=0.0)
+        nodes = [node for tree in leader for node in tree.nodes() if node.ungrasped][: rollout.batch]
+        if not nodes or SLIPPED * _mean_worth(leader) >= rival:
+            return
+        _, real, states = _padded(nodes, rollout.batch)
+        for node, holds in zip(nodes, rollout.grasp(bank, states, real), strict=False):
+            node.ungrasped = False
+            node.promise *= 1.0 if holds else SLIPPED

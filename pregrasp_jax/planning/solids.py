@@ -55,9 +55,9 @@ def corners(support: np.ndarray, angle: np.ndarray | np.floating) -> np.ndarray:
 
 def tighten(support: np.ndarray) -> np.ndarray:
     """Return the largest support [..., NUM_SIDES] below the one given that has no side shorter than `MIN_SIDE`."""
-    step = 2 * np.pi / NUM_SIDES
+    step, sides = 2 * np.pi / NUM_SIDES, np.arange(NUM_SIDES)
     for _ in range(8 * NUM_SIDES):
-        beside = np.roll(support, 1, axis=-1) + np.roll(support, -1, axis=-1)
+        beside = support[..., sides - 1] + support[..., sides + 1 - NUM_SIDES]
         allowed = (beside - 1.01 * MIN_SIDE * np.sin(step)) / (2 * np.cos(step))
         if (support <= allowed + 1e-3 * MIN_SIDE).all():
             break
