@@ -50,7 +50,7 @@ class PlanningConfig:
     budget_ms: float = 0.0
     """ms for a decision: no round of simulations begins that would exceed it. 0 sets no limit, and results repeat."""
     candidates: int = 8
-    """Pushes that the network proposes, 2 cm apart; scripts add to them up to 16."""
+    """Pushes that the network proposes, 2 cm apart; scripts add to them up to 12."""
     variants: int = 6
     """Most rebuilt scenes in which a push is tried; all but the first have other poses, sides, masses and friction."""
     depth: int = 2

@@ -15,8 +15,6 @@ from pathlib import Path
 import jax
 import pytest
 
-gc.disable()  # until everything is imported
-
 MAX_MB = 2048
 """Resident memory that a worker may have; compiling the push of `mjx` and remeshing by CoACD take nearly as much."""
 
@@ -69,11 +67,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST)))
 
 
-def pytest_collection_finish() -> None:
-    """Leave what was imported out of every later collection of garbage, of which there is one after each module."""
-    gc.collect()
-    gc.freeze()
-    gc.enable()
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Collect no garbage while test files are imported, nor what they have imported after each of them has run."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.collect()
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.fixture

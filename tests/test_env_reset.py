@@ -73,7 +73,7 @@ def test_reset_draws_scene_yaw_and_eligible_target(choosy, resets):
 
 
 def test_tight_targets_are_drawn_as_often_as_they_weigh(env):
-    """Of the built-in objects four fit at some yaws only; nothing but the training's resets draws by weights."""
+    """Of the built-in seen objects three fit at some yaws only; nothing but the training's resets draws by weights."""
     config = Config(scene=SceneConfig(train_scenes=3, test_scenes=3), train=TrainConfig(tight_targets=5.0))
     weighed = make_env(config, split="train")
     weights = weighed.target_weights

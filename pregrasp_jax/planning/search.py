@@ -200,7 +200,7 @@ def _grasp_leader(rollout: Rollout, bank: HullBank, best: list[list[Node]]) -> N
 
     So on for whoever leads then: the one chosen in the end is the one that trying all grasps would choose.
     """
-    for _ in best:
+    while True:
         leader, *others = sorted(best, key=_mean_worth, reverse=True)
         rival = max(map(_mean_worth, others), default=0.0)
         nodes = [node for tree in leader for node in tree.nodes() if node.ungrasped][: rollout.batch]
