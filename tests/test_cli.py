@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 import trimesh
+from bad_files import InlineExecutor
 from drawn_params import drawn_params
 from fake_env import fake_env
 from PIL import Image
@@ -19,6 +20,7 @@ from report_files import write_evaluation
 
 import pregrasp_jax
 from pregrasp_jax import io, startup
+from pregrasp_jax.assets import meshes
 from pregrasp_jax.checkpoint import save_policy
 from pregrasp_jax.cli import commands, doctor, progress
 from pregrasp_jax.cli import evaluate as evaluate_module
@@ -303,17 +305,18 @@ def test_a_small_machine_is_guarded_whatever_nproc_says(monkeypatch: pytest.Monk
 
 def test_assets_lists_and_draws_a_folder(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PREGRASP_JAX_CACHE", str(tmp_path / "cache"))
-    meshes = tmp_path / "meshes"
-    meshes.mkdir()
-    trimesh.creation.box((0.06, 0.06, 0.15)).export(meshes / "carton.stl")
-    trimesh.creation.box((60.0, 60.0, 150.0)).export(meshes / "millimetres.stl")
+    monkeypatch.setattr(meshes, "WorkerPool", InlineExecutor)
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    trimesh.creation.box((0.06, 0.06, 0.15)).export(folder / "carton.stl")
+    trimesh.creation.box((60.0, 60.0, 150.0)).export(folder / "millimetres.stl")
     png = tmp_path / "sheet.png"
-    code, out, err = run("assets", str(meshes), "--png", str(png))
+    code, out, err = run("assets", str(folder), "--png", str(png))
     assert code == 0, err
     assert "carton" in out and "refused: millimetres.stl" in out
     image = np.asarray(Image.open(png))
     assert image.ndim == 3 and image.std() > 5
-    code, out, err = run("assets", str(meshes), "--variants", "2", "--png", str(png))
+    code, out, err = run("assets", str(folder), "--variants", "2", "--png", str(png))
     assert code == 0, err
     assert "made_0001" in out and "2 objects" in out and "millimetres" not in out
     code, _, err = run("assets", "--variants", "-1", "--png", str(png))

@@ -121,7 +121,7 @@ def test_the_wheel_trains_and_evaluates_without_the_checkout(built: Built, tmp_p
     where = run(program.parent / "python", "-c", "import pregrasp_jax; print(pregrasp_jax.__file__)", cwd=away)
     assert Path(where).is_relative_to(tmp_path / "environment")
 
-    limits = ["--train.minutes", "0", "--train.episodes", "2"]
+    limits = ["--train.minutes", "0", "--train.episodes", "2", "--films", str(dependencies == "installed")]
     run(program, "train", "ci", "--run-dir", "run", *limits, cwd=away, **cache)
     assert (away / "run" / "report.html").is_file() and list((away / "run" / "checkpoints").iterdir())
 
