@@ -61,6 +61,13 @@ LONGEST = [
 """Modules to begin with, so that no worker ends the run alone with one of them; those that take most memory first."""
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Return one worker more than there are cores: some tests wait for processes, signals and devices."""
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    return len(cores) + 1
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest modules first; the others stay in order."""
     places = {name: place for place, name in enumerate(LONGEST)}
