@@ -157,10 +157,12 @@ class ReplayConfig:
 class LearnerConfig:
     """Q-learning (Sec. III-E)."""
 
+    optimizer: Literal["adam", "muon"] = "adam"
+    """Adam as in the paper, or Muon for the kernels before the readout (docs/learning.md)."""
     learning_rate: float = 1e-4
-    """Adam step size."""
+    """Step size of the optimizer."""
     final_learning_rate: float = 1e-4
-    """Adam step size at the end of a linear decay."""
+    """Step size at the end of a linear decay."""
     learning_rate_steps: int | None = None
     """Updates over which the step size decays; 0 keeps it, None takes `learning_rate_fraction` of the run."""
     learning_rate_fraction: float = 1.0

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.heightmap import SEGMENTATION, network_input
-from pregrasp_jax.learning.networks import Conv, upsample
+from pregrasp_jax.learning.networks import READOUT, Conv, upsample
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.types import HandPose, Observation
 
@@ -170,7 +170,7 @@ class CompactNetwork(nn.Module):
             # Zero at first: a network of identities learns from the first update on.
             x = nn.relu(x + Conv(self.channels, 3, nn.initializers.zeros, float32, name=f"block{i}_out")(hidden))
         small = nn.initializers.variance_scaling(1e-4, "fan_in", "normal")
-        q = Conv(self.num_choices, 1, small, float32, nn.initializers.constant(self.initial_bias), name="readout")(x)
+        q = Conv(self.num_choices, 1, small, float32, nn.initializers.constant(self.initial_bias), name=READOUT)(x)
         for _ in range(int(math.log2(PATCH))):
             q = upsample(q)
         return q

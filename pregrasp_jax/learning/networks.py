@@ -18,6 +18,9 @@ from jax.nn.initializers import Initializer
 HEIGHT, SEGMENTATION = 0, 1
 """Channels of the network's input."""
 
+READOUT = "readout"
+"""Name of the layer whose outputs are the values, in every network."""
+
 
 def interpolation_weights(positions: jax.Array, num_cells: int) -> jax.Array:
     """Return weights [..., P, num_cells] that read a line of cells at fractional `positions` [..., P], linearly.

@@ -12,17 +12,22 @@ import flax.struct as struct
 import jax
 import jax.numpy as jnp
 import optax
+from optax.contrib import MuonDimensionNumbers, muon
 
 from pregrasp_jax.config import LearnerConfig, ReplayConfig
 from pregrasp_jax.learning import hindsight, learner
 from pregrasp_jax.learning import replay as replay_lib
 from pregrasp_jax.learning.learner import LearnerState
+from pregrasp_jax.learning.networks import READOUT
 from pregrasp_jax.learning.q_function import Params
 from pregrasp_jax.learning.records import Replay, Steps
 from pregrasp_jax.policies.exploration import linear_schedule
 from pregrasp_jax.task.rules import Rules
 from pregrasp_jax.training.collect import Experience
 from pregrasp_jax.training.schedules import Pace
+
+_MUON_RMS = 0.2
+"""Root mean square of an update of a kernel by Muon, in step sizes: that of Adam in practice."""
 
 
 class Learning(struct.PyTreeNode):
@@ -123,16 +128,34 @@ def make_update(config: LearnerConfig, **options: Any) -> UpdateFn:
 
 
 def make_optimizer(config: LearnerConfig, steps: Any = math.inf) -> optax.GradientTransformation:
-    """Return Adam, its step size constant or decaying linearly.
+    """Return Adam or Muon, the step size constant or decaying linearly.
+
+    Muon makes the update of a kernel orthogonal, so that no few directions take most of it, and as large as one of Adam
+    usually is (root mean square 0.2): the same step sizes suit both. Biases and the readout keep Adam, with Nesterov's
+    momentum as Muon has it.
 
     Args:
-        config: where the step size begins and ends.
+        config: which one, and where the step size begins and ends.
         steps: () updates after which it stays, see `schedules`. The state of the optimizer does not depend on it.
+
+    Source: Jordan et al. 2024 (Muon); Liu et al. 2025 for the size of its updates.
     """
-    if config.learning_rate_steps == 0:
-        return optax.adam(config.learning_rate)
-    start, end = config.learning_rate, config.final_learning_rate
-    return optax.adam(lambda count: linear_schedule(jnp.asarray(count), start=start, end=end, steps=steps))
+    start, end, rate = config.learning_rate, config.final_learning_rate, config.learning_rate
+    if config.learning_rate_steps != 0:
+        rate = lambda count: linear_schedule(jnp.asarray(count), start=start, end=end, steps=steps)  # noqa: E731
+    if config.optimizer == "adam":
+        return optax.adam(rate)
+    return muon(rate, consistent_rms=_MUON_RMS, muon_weight_dimension_numbers=_kernels)
+
+
+def _kernels(params: Params) -> Any:
+    """Return which axes of a kernel [rows, cols, C_in, C_out] are those of its matrix; None for all else."""
+
+    def matrix(path: tuple[Any, ...], leaf: jax.Array) -> MuonDimensionNumbers | None:
+        readout = any(getattr(key, "key", None) == READOUT for key in path)
+        return MuonDimensionNumbers((0, 1, 2), 3) if leaf.ndim == 4 and not readout else None
+
+    return jax.tree_util.tree_map_with_path(matrix, params)
 
 
 METRICS = (
