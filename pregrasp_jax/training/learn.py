@@ -140,9 +140,12 @@ def make_optimizer(config: LearnerConfig, steps: Any = math.inf) -> optax.Gradie
 
     Source: Jordan et al. 2024 (Muon); Liu et al. 2025 for the size of its updates.
     """
-    start, end, rate = config.learning_rate, config.final_learning_rate, config.learning_rate
-    if config.learning_rate_steps != 0:
-        rate = lambda count: linear_schedule(jnp.asarray(count), start=start, end=end, steps=steps)  # noqa: E731
+
+    def decaying(count: Any) -> jax.Array:
+        start, end = config.learning_rate, config.final_learning_rate
+        return linear_schedule(jnp.asarray(count), start=start, end=end, steps=steps)
+
+    rate = config.learning_rate if config.learning_rate_steps == 0 else decaying
     if config.optimizer == "adam":
         return optax.adam(rate)
     return muon(rate, consistent_rms=_MUON_RMS, muon_weight_dimension_numbers=_kernels)
