@@ -133,6 +133,9 @@ class NetworkConfig:
     """Q-value of every push before training."""
     mirror: bool = False
     """Average the values of a scene and of its mirror image, and learn from either at random."""
+    members: int = 1
+    """Networks whose mean is the value. They start apart and learn from the same pushes, each for itself; a decision
+    and an update take so many times as long."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,6 +23,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "physics.threads": (0, 1024),
     "network.width": (1 / 32, 4.0),
     "network.initial_bias": (-4.0, 4.0),
+    "network.members": (1, 16),
     "replay.capacity": (64, 10_000_000),
     "replay.priority_exponent": (0.0, 1.0),
     "replay.importance_exponent": (0.0, 1.0),

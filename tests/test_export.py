@@ -51,17 +51,17 @@ def run(model: onnx.ModelProto, inputs: dict[str, np.ndarray]) -> np.ndarray:
 
 
 CASES = [
-    ("compact", 1 / 32, True, True),
-    pytest.param("compact", 0.25, True, False, marks=pytest.mark.slow),
-    ("compact", 1 / 16, False, False),
-    ("paper", 1 / 32, True, False),
-    pytest.param("paper", 1 / 16, False, True, marks=pytest.mark.slow),
+    ("compact", 1 / 32, True, True, 1),
+    pytest.param("compact", 0.25, True, False, 1, marks=pytest.mark.slow),
+    ("compact", 1 / 16, False, False, 3),
+    ("paper", 1 / 32, True, False, 2),
+    pytest.param("paper", 1 / 16, False, True, 1, marks=pytest.mark.slow),
 ]
 
 
-@pytest.mark.parametrize(("architecture", "width", "mirror", "full_ring"), CASES)
-def test_the_graph_says_what_the_network_says(architecture, width, mirror, full_ring):
-    network = NetworkConfig(architecture=architecture, width=width, mirror=mirror)
+@pytest.mark.parametrize(("architecture", "width", "mirror", "full_ring", "members"), CASES)
+def test_the_graph_says_what_the_network_says(architecture, width, mirror, full_ring, members):
+    network = NetworkConfig(architecture=architecture, width=width, mirror=mirror, members=members)
     config = Config(network=network, task=TaskConfig(full_ring=full_ring))
     q_function = make_q_function(config.network, config.task, ACTIONS)
     params = random_params(q_function)

@@ -99,7 +99,7 @@ def tabular_at(params, inputs, action):
 
 def table(apply=tabular) -> Any:
     """Return the Q-function of a table, on a grid of H x W cells."""
-    return SimpleNamespace(apply=apply, at=tabular_at)
+    return SimpleNamespace(apply=apply, at=tabular_at, networks=lambda params: [params])
 
 
 SUCCESS = REASONS.index("target_in_region")
@@ -254,7 +254,7 @@ def test_one_trace():
         return tabular_at(params, inputs, action)
 
     optimizer = optax.adam(1e-3)
-    q = SimpleNamespace(apply=counted, at=counted_at)
+    q = SimpleNamespace(apply=counted, at=counted_at, networks=lambda params: [params])
     options = OPTIONS | {"q": q, "mask_fn": first_row, "optimizer": optimizer}
     step = jax.jit(lambda s, b: learner.update(s, b, **options))
     state = learner.init(jnp.zeros((2, H, W, 2)), optimizer)

@@ -12,6 +12,7 @@ from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.meshes import LoadedDir, load_object_dir
 from pregrasp_jax.assets.sets import format_table
 from pregrasp_jax.assets.variants import variant_bank
+from pregrasp_jax.checkpoint.combine import combine as combine_policies
 from pregrasp_jax.cli import doctor as machine_doctor
 from pregrasp_jax.cli.outputs import refuse_unwritable
 from pregrasp_jax.config import AssetsConfig, Config, ObjectSet, SceneConfig, TaskConfig
@@ -65,6 +66,18 @@ def assets(
         print(f"{name} ({object_dir or 'built in'})\n{format_table(loaded, why_not)}")
         if loaded.bank.names:
             _write_image(file, contact_sheet(loaded.bank, eligible))
+
+
+def combine(policies: tuple[str, ...], /, *, out: Path) -> None:
+    """Make one policy of several: the value of a push is the mean of theirs.
+
+    Args:
+        policies: two or more of one network, task and discount: run folders, policy folders, or pretrained.
+        out: folder of the new policy. It is evaluated, exported and trained on (`train ... --init-from OUT
+            --network.members N`) like any other.
+    """
+    policy = combine_policies(policies, out)
+    print(f"wrote {out}: the mean of {policy.config.network.members} networks")
 
 
 def compare(a: Path, b: Path, /, *, across_workspaces: bool = False, json: Path | None = None) -> None:

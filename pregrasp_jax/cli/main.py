@@ -38,6 +38,7 @@ class Command:
 COMMANDS = {
     "assets": Command("List and draw the objects of a mesh folder.", "pregrasp_jax.cli.commands:assets"),
     "calibrate-check": Command("Say how well a calibration fits the table.", "pregrasp_jax.cli.deploy:calibrate_check"),
+    "combine": Command("Make one policy of several.", "pregrasp_jax.cli.commands:combine"),
     "compare": Command("Compare two evaluations on the same scenes.", "pregrasp_jax.cli.commands:compare"),
     "contract": Command("Print what a bundle says about itself.", "pregrasp_jax.cli.export:contract"),
     "demo": Command("See the shipped policy at work, then train for minutes.", "pregrasp_jax.cli.demo:demo"),

@@ -153,6 +153,7 @@ class Training:
     width: float
     mirror: bool
     parameters: int
+    members: int = 1
     config: dict[str, Any]
 
 
@@ -183,6 +184,10 @@ def to_plain(contract: Contract) -> dict[str, Any]:
     return dataclasses.asdict(contract)
 
 
+def _mean_of(members: int) -> str:
+    return f", mean of {members} networks" if members > 1 else ""
+
+
 def format_contract(contract: Contract) -> str:
     """Return the contract as text for people: Markdown that reads as plain text too."""
     grid, action, robot, camera = contract.grid, contract.action, contract.robot, contract.camera
@@ -191,7 +196,7 @@ def format_contract(contract: Contract) -> str:
         "",
         f"{contract.format}, made {contract.created} with pregrasp_jax {contract.versions.get('pregrasp_jax', '?')}. "
         f"{contract.training.parameters} parameters, {contract.training.architecture} network of width "
-        f"{contract.training.width:g}.",
+        f"{contract.training.width:g}{_mean_of(contract.training.members)}.",
         "",
         "## Inputs and outputs",
         "",

@@ -6,7 +6,7 @@ operation, and tested against it.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from pregrasp_jax.export.graph import Graph
 from pregrasp_jax.heightmap import SEGMENTATION
 from pregrasp_jax.heightmap.observation import MIN_STD
 from pregrasp_jax.learning.compact import PATCH, WindowSize, window_size
+from pregrasp_jax.learning.members import split
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace
 
@@ -55,7 +56,7 @@ def _paper_values(graph: Graph, params: Params, config: Config, actions: ActionS
     segmentation = graph("Div", graph.cast("labels", TensorProto.FLOAT), _scalar(max(SEGMENTATION.values())))
     images = graph("Concat", *(_as_channel(graph, image) for image in (_heights(graph), segmentation)), axis=1)
 
-    def values(images: str) -> str:
+    def readout(images: str, params: Params) -> str:
         features = [
             _residual_block(graph, _channel(graph, images, index), params[f"{name}_block"])
             for index, name in enumerate(("height", "segmentation"))
@@ -65,8 +66,11 @@ def _paper_values(graph: Graph, params: Params, config: Config, actions: ActionS
         for index in range(_count(params, "deep_")):
             x = _residual_block(graph, x, params[f"deep_{index}"])
         x = _residual_block(graph, _upsample(graph, x, SIZE // 4, SIZE // 4, 1), params["up"])
-        x = _upsample(graph, _conv(graph, x, params["readout"]), SIZE // 2, SIZE // 2, 1)
-        return graph("Transpose", x, perm=[0, 2, 3, 1])
+        return _conv(graph, x, params["readout"])
+
+    def values(images: str) -> str:
+        x = _mean(graph, [readout(images, member) for member in split(params, config.network.members)])
+        return graph("Transpose", _upsample(graph, x, SIZE // 2, SIZE // 2, 1), perm=[0, 2, 3, 1])
 
     if not config.network.mirror:
         return values(images)
@@ -96,11 +100,15 @@ def _compact_values(graph: Graph, params: Params, config: Config, actions: Actio
     origin_cols = graph("Concat", *[col] * len(origins), axis=0) if len(origins) > 1 else col
     x = graph("SpaceToDepth", graph("Transpose", window, perm=[0, 3, 1, 2]), blocksize=PATCH)
     x = graph("Concat", x, _coordinates(graph, origin_rows, origin_cols, (rows - 1, cols)), axis=1)
-    x = _relu(graph, _conv(graph, x, params["stem"]))
-    for index in range(_count(params, "_in")):
-        hidden = _relu(graph, _conv(graph, x, params[f"block{index}_in"]))
-        x = _relu(graph, graph("Add", x, _conv(graph, hidden, params[f"block{index}_out"])))
-    q = _conv(graph, x, params["readout"])
+
+    def readout(x: str, params: Params) -> str:
+        x = _relu(graph, _conv(graph, x, params["stem"]))
+        for index in range(_count(params, "_in")):
+            hidden = _relu(graph, _conv(graph, x, params[f"block{index}_in"]))
+            x = _relu(graph, graph("Add", x, _conv(graph, hidden, params[f"block{index}_out"])))
+        return _conv(graph, x, params["readout"])
+
+    q = _mean(graph, [readout(x, member) for member in split(params, config.network.members)])
     q = _upsample(graph, q, (rows - 1) // PATCH, cols // PATCH, int(math.log2(PATCH)))
     q = graph("Transpose", q, perm=[0, 2, 3, 1])
     q = graph("Reshape", q, np.array([0, (rows - 1) * cols, actions.num_choices]))
@@ -140,6 +148,11 @@ def _channel(graph: Graph, images: str, index: int) -> str:
 
 def _flip_rows(graph: Graph, x: str, *, axis: int) -> str:
     return graph("Gather", x, np.arange(SIZE)[::-1].copy(), axis=axis)
+
+
+def _mean(graph: Graph, values: Sequence[str]) -> str:
+    """Return the mean of what the members say; it commutes with the interpolation that follows."""
+    return graph("Mean", *values) if len(values) > 1 else values[0]
 
 
 def _mean_of_mirrored(graph: Graph, q: str, flip: Callable[[str], str], actions: ActionSpace) -> str:

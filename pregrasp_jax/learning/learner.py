@@ -104,6 +104,8 @@ def update(
 ) -> tuple[LearnerState, jax.Array, jax.Array, dict[str, jax.Array]]:
     """Take one gradient step.
 
+    Every member of `q` learns for itself, towards targets that are the mean of all.
+
     Args:
         state: what changes.
         batch: B states, each with K pushes; the gradient flows through the pixels of these pushes only.
@@ -114,8 +116,8 @@ def update(
         config: discount, polyak, loss.
 
     Returns:
-        The next state, TD errors [B, K] (signed), 0 where nothing is known of the next state, the values [B, K] of the
-        next states, `UNKNOWN` where they are not, and metrics () each.
+        The next state, TD errors [B, K] of the mean of all members, signed, 0 where nothing is known of the next state,
+        the values [B, K] of the next states, `UNKNOWN` where they are not, and metrics () each.
     """
     masks = jax.vmap(mask_fn)(batch.next_hand)
     fresh = jax.vmap(max_q)(q.apply(state.target_params, batch.next_inputs), masks)
@@ -124,12 +126,16 @@ def update(
     discounted = functools.partial(td_target, discount=config.discount)
     targets = jax.vmap(jax.vmap(discounted))(batch.reward, batch.terminated, jnp.where(known, values, 0.0))
 
-    def loss_fn(params: Params) -> tuple[jax.Array, jax.Array]:
+    def of_member(params: Params) -> tuple[jax.Array, jax.Array]:
         # Mapped over pushes only: what the network does with the state is done once.
         taken = jax.vmap(q.at, (None, None, 1), 1)(params, batch.inputs, batch.action)
         errors = jnp.where(known, jax.vmap(jax.vmap(td_error))(taken, targets), 0.0)
         losses = batch.importance_weights[:, None] * huber(errors, delta=config.huber_delta)
         return jnp.sum(losses) / jnp.sum(known), errors
+
+    def loss_fn(params: Params) -> tuple[jax.Array, jax.Array]:
+        losses, errors = zip(*map(of_member, q.networks(params)), strict=True)
+        return jnp.mean(jnp.stack(losses)), jnp.mean(jnp.stack(errors), axis=0)
 
     (loss, errors), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.params)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.params)

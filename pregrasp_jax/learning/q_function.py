@@ -18,13 +18,12 @@ from pregrasp_jax.learning.compact import (
     mirror_window,
     window_size,
 )
+from pregrasp_jax.learning.members import Params, join, split
 from pregrasp_jax.learning.networks import QNetwork, same_shapes
 from pregrasp_jax.learning.records import InputFn
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace
 from pregrasp_jax.types import HandPose, Observation
-
-Params = Any
 
 _COMPACT_CHANNELS = 128
 """Channels of the compact network at width 1."""
@@ -38,7 +37,7 @@ def everywhere(hand: HandPose) -> jax.Array:
 
 @dataclass(frozen=True)
 class QFunction:
-    """A network and its input.
+    """A network, or several of which the mean counts, and its input.
 
     Attributes:
         network: has ``__call__(inputs) -> [B, H, W, K]`` and ``q_at(inputs, row [B], col [B]) -> [B, K]``.
@@ -47,6 +46,7 @@ class QFunction:
         mirror_fn: inputs of B scenes -> the same reflected in the robot's plane y = 0. Then a value is the mean of what
             the network says of a scene and of its mirror image; None leaves the network alone.
         domain_fn: hand -> [H, W] bool, where a push may end of which the network says anything.
+        members: networks of this kind whose mean a value is, see `members`.
     """
 
     network: nn.Module
@@ -54,28 +54,40 @@ class QFunction:
     input_fn: InputFn
     mirror_fn: Callable[[Any], Any] | None = None
     domain_fn: Callable[[HandPose], jax.Array] = everywhere
+    members: int = 1
 
     def init(self, key: jax.Array) -> Params:
         """Return initial parameters."""
         blank = jnp.zeros((grid.GRID_SIZE, grid.GRID_SIZE), jnp.uint8)
         hand = HandPose(jnp.zeros(2), *jnp.zeros(3))
         inputs = self.input_fn(Observation(blank, blank, hand), jnp.int32(0))
-        return self.network.init(key, jax.tree.map(lambda leaf: leaf[None], inputs))["params"]
+        inputs = jax.tree.map(lambda leaf: leaf[None], inputs)
+        keys = [key] if self.members == 1 else jax.random.split(key, self.members)
+        return join([self.network.init(key, inputs)["params"] for key in keys])
 
     def fits(self, params: Params) -> bool:
         """Return whether parameters belong to this network."""
         return same_shapes(params, jax.eval_shape(self.init, jax.random.key(0)))
 
+    def networks(self, params: Params) -> list[Params]:
+        """Return the parameters of every member."""
+        return split(params, self.members)
+
     def apply(self, params: Params, inputs: Any) -> jax.Array:
         """Return the values [B, H, W, K] of all pushes."""
-        q = jnp.asarray(self.network.apply({"params": params}, inputs))
+        q = self._mean(params, inputs)
         if self.mirror_fn is None:
             return q
-        mirrored = jnp.asarray(self.network.apply({"params": params}, self.mirror_fn(inputs)))
+        mirrored = self._mean(params, self.mirror_fn(inputs))
         return (q + self.actions.mirror_map(mirrored)) / 2
 
+    def _mean(self, params: Params, inputs: Any) -> jax.Array:
+        """Return the mean [B, H, W, K] of all members, the scenes taken as they are."""
+        each = [jnp.asarray(self.network.apply({"params": member}, inputs)) for member in self.networks(params)]
+        return sum(each[1:], start=each[0]) / len(each)
+
     def at(self, params: Params, inputs: Any, action: jax.Array) -> jax.Array:
-        """Return what the network says of the pushes `action` [B] only, the scenes taken as they are, [B]."""
+        """Return what one member says of the pushes `action` [B] only, the scenes taken as they are, [B]."""
         row, col, choice = self.actions.unravel(action)
         q = jnp.asarray(self.network.apply({"params": params}, inputs, row, col, method="q_at"))
         return jnp.take_along_axis(q, choice[:, None], axis=1)[:, 0]
@@ -100,7 +112,8 @@ def make_q_function(network: NetworkConfig, task: TaskConfig, actions: ActionSpa
     common = {"num_choices": actions.num_choices, "initial_bias": network.initial_bias}
     if network.architecture == "paper":
         mirror_fn = mirror_images if network.mirror else None
-        return QFunction(QNetwork(width=network.width, **common), actions, network_input, mirror_fn)
+        paper = QNetwork(width=network.width, **common)
+        return QFunction(paper, actions, network_input, mirror_fn, members=network.members)
     channels, size = max(1, round(_COMPACT_CHANNELS * network.width)), window_size(task)
     return QFunction(
         CompactNetwork(channels=channels, **common),
@@ -108,6 +121,7 @@ def make_q_function(network: NetworkConfig, task: TaskConfig, actions: ActionSpa
         functools.partial(look_around_hand, size=size),
         mirror_window if network.mirror else None,
         functools.partial(cells_around_hand, size=size),
+        network.members,
     )
 
 

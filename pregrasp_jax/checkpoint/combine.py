@@ -1,0 +1,61 @@
+"""Several trained policies as one, whose values are the mean of theirs."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pregrasp_jax.checkpoint.policy import TrainedPolicy, load_policy, save_policy
+from pregrasp_jax.learning.members import join, split
+from pregrasp_jax.ranges import RANGES
+from pregrasp_jax.settings import flatten, to_dict
+
+_FREE = ("network.members", "network.initial_bias")
+"""Settings of the network that may differ."""
+
+
+def combine(policies: Sequence[Path | str], folder: Path) -> TrainedPolicy:
+    """Write the policy whose value of a push is the mean of those of several policies, and return it.
+
+    Its configuration is that of the first.
+
+    Args:
+        policies: at least two, each as `load_policy` reads it. Of a policy that has several networks each counts.
+        folder: of the new policy; must not exist.
+
+    Raises:
+        ValueError: one cannot be read, has learnt by imitation, or is of another network, task or discount than the
+            first, so that its values mean something else; or there are too many networks.
+    """
+    if len(policies) < 2:
+        raise ValueError(f"combine needs at least two policies, got {len(policies)}")
+    if folder.exists():
+        raise ValueError(f"{folder} exists already; allowed is a new folder")
+    loaded = [load_policy(path) for path in policies]
+    wanted = _meaning(policies[0], loaded[0])
+    for path, policy in zip(policies, loaded, strict=True):
+        for name, value in _meaning(path, policy).items():
+            if value != wanted[name]:
+                raise ValueError(
+                    f"{path} has {name} = {value}, but {policies[0]} {wanted[name]}: the mean of their values would "
+                    f"mean nothing; allowed are policies of one network, task and discount"
+                )
+    networks = [params for policy in loaded for params in split(policy.params, policy.config.network.members)]
+    most = int(RANGES["network.members"][1])
+    if len(networks) > most:
+        raise ValueError(f"the policies have {len(networks)} networks together; allowed are {most}")
+    config = loaded[0].config
+    config = dataclasses.replace(config, network=dataclasses.replace(config.network, members=len(networks)))
+    save_policy(folder, join(networks), config, {})
+    return load_policy(folder)
+
+
+def _meaning(path: Path | str, policy: TrainedPolicy) -> dict[str, Any]:
+    """Return, by name, the settings that decide what a value means, and of what network it is."""
+    if policy.config.train.method != "q_learning":
+        raise ValueError(f"{path} has learnt by {policy.config.train.method}; allowed are policies of Q-learning")
+    return {
+        name: value
+        for name, value in flatten(to_dict(policy.config)).items()
+        if name == "learner.discount" or (name.startswith(("network.", "task.")) and name not in _FREE)
+    }

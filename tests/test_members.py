@@ -1,0 +1,148 @@
+"""Several networks as one policy: a value is their mean, and each learns for itself."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from bundles import ACTIONS, random_params, random_policy
+from test_learner import OPTIONS, first_row, make_batch, run_update, table
+
+from pregrasp_jax.checkpoint import load_policy
+from pregrasp_jax.checkpoint.policy import save_policy
+from pregrasp_jax.cli.main import main
+from pregrasp_jax.config import Config, NetworkConfig
+from pregrasp_jax.learning import learner
+from pregrasp_jax.learning.members import join, split
+from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.types import HandPose, Observation
+
+NETWORK = NetworkConfig(architecture="compact", width=1 / 32, mirror=True)
+CONFIG = Config(network=NETWORK)
+
+
+def of(config: Config, members: int) -> Config:
+    return dataclasses.replace(config, network=dataclasses.replace(config.network, members=members))
+
+
+def observation() -> Observation:
+    rng = np.random.default_rng(0)
+    height, ids = (jnp.asarray(rng.integers(0, top, (100, 100)).astype(np.uint8)) for top in (256, 3))
+    return Observation(height, ids, HandPose(jnp.array([-0.1, 0.02]), *jnp.zeros(3)))
+
+
+def values_of(params: Any, config: Config) -> np.ndarray:
+    q = make_q_function(config.network, config.task, ACTIONS)
+    return np.asarray(jax.jit(q.values)(params, observation(), jnp.int32(0)))
+
+
+def test_one_network_stays_as_it_is_and_several_come_back():
+    networks = [{"stem": np.full(2, k)} for k in range(3)]
+    assert join(networks[:1]) is networks[0] and split(networks[0], 1)[0] is networks[0]
+    assert split(join(networks), 3) == networks
+
+
+def test_a_value_is_the_mean_of_the_members():
+    single = make_q_function(NETWORK, CONFIG.task, ACTIONS)
+    networks = [random_params(single, seed) for seed in range(3)]
+    apart = [values_of(params, CONFIG) for params in networks]
+    assert np.abs(apart[0] - apart[1]).max() > 0.01
+    np.testing.assert_allclose(values_of(join(networks), of(CONFIG, 3)), np.mean(apart, axis=0), atol=1e-5)
+
+
+def test_members_start_apart_and_fit_only_a_network_of_as_many():
+    q = make_q_function(of(CONFIG, 2).network, CONFIG.task, ACTIONS)
+    params = jax.jit(q.init)(jax.random.key(0, impl="rbg"))
+    first, second = q.networks(params)
+    assert np.abs(first["stem"]["kernel"] - second["stem"]["kernel"]).max() > 0.1
+    assert q.fits(params)
+    single = make_q_function(NETWORK, CONFIG.task, ACTIONS)
+    assert single.fits(first) and not single.fits(params) and not q.fits(first)
+
+
+def test_each_member_learns_as_if_it_were_alone():
+    """One table each, all pushes final, so that targets are the rewards; Adam takes no notice of the mean's 1/2."""
+    tables = [jnp.zeros((2, 2, 3, 2)), jnp.full((2, 2, 3, 2), 5.0)]
+    batch = make_batch(
+        [0, 1], [0, 0], action=jnp.array([3, 8], jnp.int32), reward=jnp.array([2.0, 0.5]), terminated=jnp.ones(2, bool)
+    )
+    optimizer = optax.adam(0.1)
+    alone = [run_update(params, batch, optimizer)[0].params for params in tables]
+    together, errors, _, metrics = update_together(tables, batch, optimizer)
+    for found, wanted, before in zip(together.params, alone, tables, strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-5)
+        assert np.abs(wanted - before).max() > 0.05
+    np.testing.assert_allclose(errors[:, 0], [2.5 - 2.0, 2.5 - 0.5], rtol=1e-6)
+    assert float(metrics["train/q_taken"]) == pytest.approx(2.5)
+    # Linear branch of the loss, slope 0.1: errors of -2, 3 and -0.5, 4.5.
+    assert float(metrics["train/loss"]) == pytest.approx(0.1 * (np.mean([2, 3, 0.5, 4.5]) - 0.05))
+
+
+def test_targets_are_of_the_mean():
+    """The best of the mean is neither member's best."""
+    tables = [jnp.zeros((1, 2, 3, 2)).at[0, 0, 0].set(jnp.array(pair)) for pair in ([4.0, 3.0], [0.0, 3.0])]
+    _, _, values, _ = update_together(tables, make_batch([0], [0]), optax.sgd(0.0))
+    assert float(values[0, 0]) == 3.0
+
+
+def update_together(tables: list[jax.Array], batch: Any, optimizer: Any) -> Any:
+    """Return what `learner.update` does to several tables as one network."""
+    q = table(lambda params, inputs: sum(table().apply(member, inputs) for member in params) / len(params))
+    q.networks = list
+    state = learner.init(tables, optimizer)
+    options = OPTIONS | {"q": q, "mask_fn": first_row, "optimizer": optimizer}
+    return jax.jit(functools.partial(learner.update, **options))(state, batch)
+
+
+def test_combined_policies_have_the_mean_of_their_values(tmp_path, capsys):
+    policies = [random_policy(tmp_path / f"p{seed}", CONFIG, seed) for seed in range(3)]
+    assert main(["combine", str(tmp_path / "p0"), str(tmp_path / "p1"), "--out", str(tmp_path / "two")]) in (0, None)
+    assert "mean of 2 networks" in capsys.readouterr().out
+    main(["combine", str(tmp_path / "two"), str(tmp_path / "p2"), "--out", str(tmp_path / "three")])
+    three = load_policy(tmp_path / "three")
+    assert three.config == of(CONFIG, 3)
+    apart = [values_of(policy.params, CONFIG) for policy in policies]
+    np.testing.assert_allclose(values_of(three.params, three.config), np.mean(apart, axis=0), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"task.approach_reward": 0.0}, "task.approach_reward = 0.0"),
+        ({"learner.discount": 0.7}, "learner.discount = 0.7"),
+        ({"network.width": 1 / 16}, "network.width = 0.0625"),
+        ({"network.mirror": False}, "network.mirror = False"),
+        ({"train.method": "imitation"}, "learnt by imitation"),
+    ],
+)
+def test_values_that_mean_something_else_are_not_averaged(change, named, tmp_path, capsys):
+    random_policy(tmp_path / "first", CONFIG)
+    config = CONFIG
+    for name, value in change.items():
+        group, key = name.split(".")
+        config = dataclasses.replace(config, **{group: dataclasses.replace(getattr(config, group), **{key: value})})
+    params = random_params(make_q_function(config.network, config.task, ACTIONS))
+    save_policy(tmp_path / "other", params, config, {})
+    with pytest.raises(SystemExit) as stopped:
+        main(["combine", str(tmp_path / "first"), str(tmp_path / "other"), "--out", str(tmp_path / "out")])
+    assert stopped.value.code == 2 and named in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_combine_needs_two_policies_and_a_new_folder(tmp_path, capsys):
+    random_policy(tmp_path / "first", CONFIG)
+    first = str(tmp_path / "first")
+    for arguments, named in (
+        ([first, "--out", str(tmp_path / "out")], "at least two policies, got 1"),
+        ([first, first, "--out", first], "exists already"),
+        ([first, str(tmp_path / "none"), "--out", str(tmp_path / "out")], "does not exist"),
+        ([first] * 17 + ["--out", str(tmp_path / "out")], "17 networks together; allowed are 16"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["combine", *arguments])
+        assert named in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
