@@ -16,7 +16,7 @@ import pytest
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.config import SceneConfig
+from pregrasp_jax.config import SceneConfig, TaskConfig
 from pregrasp_jax.evaluation import format_evaluation, load_evaluation
 from pregrasp_jax.evaluation.deliberation import Deliberation
 from pregrasp_jax.evaluation.player import make_player, run_evaluation
@@ -26,7 +26,8 @@ from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.planning import search as searching
 from pregrasp_jax.planning.memory import NOTHING, Sight
 from pregrasp_jax.planning.planner import Planned, Planner, spread_best
-from pregrasp_jax.planning.search import chance, search
+from pregrasp_jax.planning.promise import promise_of
+from pregrasp_jax.planning.search import search
 from pregrasp_jax.robot.base import hand_pose_of
 from pregrasp_jax.task.assembly import make_env
 from pregrasp_jax.types import REASONS, EnvState, Observation, PhysicsObservation, SceneParams
@@ -104,6 +105,9 @@ def test_proposals_are_apart_and_allowed():
     assert spread_best(values, 12) == [np.ravel_multi_index((3, 3, 1), values.shape)]
 
 
+PROMISE = promise_of(TaskConfig())
+
+
 class World:
     """A rollout of made-up scenes: a push numbered a leads from state s to 10 s + a, and `rules` says what of it."""
 
@@ -135,7 +139,7 @@ class World:
 def decide(world: World, candidates: list[int], *, left: int = 10, deadline: float = math.inf, **settings: int) -> int:
     config = PlanningConfig(**{"variants": 2, "depth": 1} | settings)
     roots = np.arange(1, config.variants + 1)
-    found = search(world, None, roots, candidates, config, left=left, deadline=deadline)
+    found = search(world, None, roots, candidates, config, PROMISE, left=left, deadline=deadline)
     assert found.pushes == world.pushes
     return found.action
 
@@ -230,10 +234,18 @@ def test_without_time_one_round_decides():
     assert world.pushes == 5 and world.calls == 2
 
 
-def test_chances_rise_with_values():
-    found = chance(np.linspace(-1, 3, 50))
+@pytest.mark.parametrize("approach", [0.5, 0.0])
+def test_chances_rise_with_values_and_are_in_rewards_of_a_success(approach: float):
+    found = promise_of(TaskConfig(approach_reward=approach))(np.linspace(-1, 3, 50))
     assert (np.diff(found) >= 0).all() and 0 < found[0] < 0.1 and 0.9 < found[-1] < 1
-    assert 0 < searching.DISCOUNT < 1 and 0 < searching.SALVAGE < 1
+    tripled = promise_of(TaskConfig(approach_reward=approach, in_region_reward=6.0))(3 * np.linspace(-1, 3, 50))
+    np.testing.assert_allclose(tripled, found)
+
+
+def test_a_value_promises_more_where_coming_nearer_does_not_count():
+    values = np.array([0.6, 0.9, 1.2])
+    counting, alone = (promise_of(TaskConfig(approach_reward=reward))(values) for reward in (0.5, 0.0))
+    assert (alone > counting + 0.05).all()
 
 
 @pytest.mark.parametrize(
@@ -274,7 +286,8 @@ def test_hidden_state_cannot_leak():
     env = make_env(config, split="test", threads=1)
     q_function = make_q_function(config.network, policy.config.task, env.primitive.actions)
     blind = dataclasses.replace(env, bank=None, scenes=None, engine=None, eligible=None)
-    planner = Planner(blind, q_function, policy.params, PlanningConfig(depth=0, variants=1), threads=1)
+    promise = promise_of(policy.config.task)
+    planner = Planner(blind, q_function, policy.params, PlanningConfig(depth=0, variants=1), promise=promise, threads=1)
     states = jax.device_get(jax.jit(jax.vmap(env.reset_to))(jnp.arange(2)))
     rng = np.random.default_rng(0)
     ids, poses = states.scene.object_ids, states.physics_obs.object_poses

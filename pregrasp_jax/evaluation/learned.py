@@ -10,6 +10,7 @@ from pregrasp_jax.evaluation_config import EvaluationConfig
 from pregrasp_jax.learning.imitation import StrokeFunction
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.planning.planner import Planner
+from pregrasp_jax.planning.promise import promise_of
 from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.policies.ppg import greedy, make_ppg, make_target_ppg
 from pregrasp_jax.policies.scripts import Policy
@@ -36,7 +37,10 @@ def _play_q(env: Env, trained: TrainedPolicy, style: str, request: EvaluationCon
     # Of the task that it was trained on: a window of another size is another input.
     q_function = make_q_function(trained.config.network, trained.config.task, env.primitive.actions)
     if request.plan:
-        policy = Planner(env, q_function, trained.params, request.planning, threads=request.physics.threads)
+        promise = promise_of(trained.config.task)
+        policy = Planner(
+            env, q_function, trained.params, request.planning, promise=promise, threads=request.physics.threads
+        )
     else:
         policy = make_learned(env, q_function.values, reachable=request.reachable)(trained.params)
     return Learned(

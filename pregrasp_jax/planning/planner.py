@@ -14,6 +14,7 @@ from pregrasp_jax.learning.q_function import QFunction
 from pregrasp_jax.planning import memory as remembering
 from pregrasp_jax.planning import simulation
 from pregrasp_jax.planning.memory import Memory, Sight
+from pregrasp_jax.planning.promise import Promise
 from pregrasp_jax.planning.rebuild import draw_variants, hidden_cells
 from pregrasp_jax.planning.rollout import Rollout
 from pregrasp_jax.planning.search import search
@@ -46,7 +47,16 @@ class Planned(NamedTuple):
 class Planner:
     """Decides for one scene at a time; from one decision to the next it keeps compiled programs and what they took."""
 
-    def __init__(self, env: Env, q_function: QFunction, params: Any, config: PlanningConfig, *, threads: int = 0):
+    def __init__(
+        self,
+        env: Env,
+        q_function: QFunction,
+        params: Any,
+        config: PlanningConfig,
+        *,
+        promise: Promise,
+        threads: int = 0,
+    ):
         """Compile the model of rebuilt objects.
 
         Args:
@@ -54,9 +64,11 @@ class Planner:
             q_function: of the policy that proposes and continues.
             params: of the policy.
             config: how much is searched.
+            promise: what the values of the policy mean, `promise.promise_of` the task that it was trained on.
             threads: of the simulations; 0 takes every core, and decisions do not depend on it.
         """
-        self._config, self._robot, self._max_pushes = config, env.robot, env.task.max_pushes
+        self._config, self._promise = config, promise
+        self._robot, self._max_pushes = env.robot, env.task.max_pushes
         self._simulations = simulation.make_simulations(
             env.robot, env.workspace, num_variants=config.variants, threads=threads
         )
@@ -87,7 +99,9 @@ class Planner:
         candidates = list(dict.fromkeys([*proposed, *scripted]))
         limit = self._config.budget_ms / 1e3 if self._config.budget_ms else math.inf
         left = self._max_pushes - sight.pushes
-        found = search(self._rollout, bank, roots, candidates, self._config, left=left, deadline=begin + limit)
+        found = search(
+            self._rollout, bank, roots, candidates, self._config, self._promise, left=left, deadline=begin + limit
+        )
         self._seconds.append(time.perf_counter() - begin)
         self._pushes.append(found.pushes)
         return Planned(found.action, memory)

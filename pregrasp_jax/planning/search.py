@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from pregrasp_jax.evaluation_config import PlanningConfig
+from pregrasp_jax.planning.promise import Promise
 from pregrasp_jax.planning.rollout import Pushed, Rollout
 from pregrasp_jax.types import EnvState, HullBank
 
@@ -32,10 +33,6 @@ SALVAGE = 0.6
 SLIPPED = 0.85
 """Share of its worth that an enclosed target keeps which the simulated grasp does not hold: in truth 97 of 100 enclosed
 targets are held, and a rebuilt shape may slip where the object does not."""
-
-_VALUES, _CHANCES = (0.4, 0.9, 1.2, 1.5, 2.0), (0.05, 0.25, 0.65, 0.8, 0.97)
-"""How often episodes of `pretrained` ended well, by what it said of its best push: 200 episodes on validation scenes of
-built-in objects and of distorted ones."""
 
 
 class Choice(NamedTuple):
@@ -89,17 +86,13 @@ class Node:
             yield from child.nodes()
 
 
-def chance(values: np.ndarray) -> np.ndarray:
-    """Return how likely an episode ends well, [...], whose best push the network values at [...]."""
-    return np.interp(values, _VALUES, _CHANCES)
-
-
 def search(
     rollout: Rollout,
     bank: HullBank,
     roots: EnvState,
     candidates: list[int],
     config: PlanningConfig,
+    promise: Promise,
     *,
     left: int,
     deadline: float,
@@ -112,6 +105,7 @@ def search(
         roots: [V] the rebuilt scene in all variants, as host arrays.
         candidates: flat indices of Q, at least one.
         config: how deep, in how many variants.
+        promise: what the values of the network mean.
         left: pushes that the episode may still have, the one that is searched for included.
         deadline: by `time.perf_counter`; no round begins that would not end before it.
     """
@@ -126,7 +120,7 @@ def search(
         batches = _batches(due, rollout.batch)
         # All are under way before the first is looked at: its pictures are drawn while the next is pushed.
         for nodes, pushed in zip(batches, [_push(rollout, bank, nodes) for nodes in batches], strict=True):
-            _grow(rollout, nodes, pushed, left)
+            _grow(rollout, nodes, pushed, promise, left)
         if len(best) <= GRASPED:
             _grasp_leader(rollout, bank, [trees[c] for c in best])
         last = time.perf_counter() - begin
@@ -176,11 +170,11 @@ def _push(rollout: Rollout, bank: HullBank, nodes: list[Node]) -> Pushed:
     return rollout.push(bank, states, actions, real)
 
 
-def _grow(rollout: Rollout, nodes: list[Node], pushed: Pushed, left: int) -> None:
-    """Append to every node where its push has led; `left` is as in `search`."""
+def _grow(rollout: Rollout, nodes: list[Node], pushed: Pushed, promise: Promise, left: int) -> None:
+    """Append to every node where its push has led; `promise` and `left` are as in `search`."""
     ends, proposals, terminated = jax.device_get((pushed.states, pushed.actions, pushed.results.terminated))
     enclosed = rollout.succeeded(pushed.results.reason)
-    chances = DISCOUNT * chance(np.asarray(pushed.values))
+    chances = DISCOUNT * promise(np.asarray(pushed.values))
     for i, node in enumerate(nodes):
         in_time = 1 - (1 - ENDS) ** (left - node.depth - 1)
         safety = node.safety * float(pushed.safety[i])
