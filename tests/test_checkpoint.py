@@ -283,3 +283,14 @@ def test_a_run_without_best_policy_gives_its_latest_checkpoint(tmp_path):
     loaded = policy.load_policy(tmp_path)
     assert trees.checksum(loaded.params) == trees.checksum(make_params(1))
     assert (checkpoints / "000000002").is_dir(), "reading a policy must not change the run"
+
+
+def test_the_latest_checkpoint_can_be_asked_for_beside_a_best_policy(tmp_path):
+    write_config(tmp_path / "config.yaml", Config())
+    policy.save_policy(tmp_path / "best", make_params(5), Config(), {})
+    save(tmp_path / "checkpoints", 1, 4)
+    for path, params in ((tmp_path, make_params(5)), (tmp_path / "checkpoints", make_params(1))):
+        assert trees.checksum(policy.load_policy(path).params) == trees.checksum(params)
+    (tmp_path / "other").mkdir()
+    with pytest.raises(ValueError, match="allowed: pretrained, a run folder or its checkpoints"):
+        policy.load_policy(tmp_path / "other")

@@ -42,7 +42,9 @@ _PARAMS = "params.safetensors"
 BUNDLED = "policy.safetensors"
 """The same file in an exported bundle."""
 
-_ALLOWED = f"pretrained, a run folder, a folder with the {_PARAMS} that it wrote, or an exported bundle"
+_ALLOWED = (
+    f"pretrained, a run folder or its checkpoints, a folder with the {_PARAMS} that it wrote, or an exported bundle"
+)
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ def policy_bytes(params: Any, config: Config, evaluation: dict[str, Any]) -> byt
 def load_policy(path: Path | str) -> TrainedPolicy:
     """Read a policy from a run folder (its best policy, else its latest checkpoint), a policy folder, or a file.
 
-    The names in `SHIPPED` are those of policies that ship with the package.
+    The folder `checkpoints` of a run stands for its latest checkpoint, whatever was best. The names in `SHIPPED` are
+    those of policies that ship with the package.
 
     Raises:
         ValueError: nothing there, damaged, or not written by `save_policy`; one line says which.
@@ -91,8 +94,9 @@ def load_policy(path: Path | str) -> TrainedPolicy:
                 return _read_policy(candidate)
             except ValueError as error:
                 raise type(error)(f"{error}; allowed: {_ALLOWED}") from None
-    if (path / CONFIG).is_file() and (path / "checkpoints").is_dir():
-        return _policy_of_checkpoint(path / "checkpoints", stored_config(path))
+    for checkpoints in (path / "checkpoints", path):
+        if checkpoints.name == "checkpoints" and checkpoints.is_dir() and (checkpoints.parent / CONFIG).is_file():
+            return _policy_of_checkpoint(checkpoints, stored_config(checkpoints.parent))
     problem = "is neither a run folder nor a policy folder" if path.is_dir() else "does not exist"
     raise ValueError(f"policy {path} {problem}; allowed: {_ALLOWED}")
 

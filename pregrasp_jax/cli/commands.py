@@ -72,7 +72,8 @@ def combine(policies: tuple[str, ...], /, *, out: Path) -> None:
     """Make one policy of several: the value of a push is the mean of theirs.
 
     Args:
-        policies: two or more of one network, task and discount: run folders, policy folders, or pretrained.
+        policies: two or more of one network, task and discount: run folders (the best policy of a run), their
+            folders `checkpoints` (the latest), policy folders, or pretrained.
         out: folder of the new policy. It is evaluated, exported and trained on (`train ... --init-from OUT
             --network.members N`) like any other.
     """
