@@ -25,6 +25,9 @@ Normalization = Literal["none", "batch"]
 STYLES = ("ppg", "target-ppg")
 """Ways of playing a policy of strokes, and names of the one that ships."""
 
+PUSHING = ("pretrained", "cpu-1")
+"""Names of the policies of pushes that ship: the best, and what the preset `cpu` makes with seed 1 in 100 minutes."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class AssetsConfig:
@@ -133,9 +136,14 @@ class NetworkConfig:
     """Q-value of every push before training."""
     mirror: bool = False
     """Average the values of a scene and of its mirror image, and learn from either at random."""
-    members: int = 1
-    """Networks whose mean is the value. They start apart and learn from the same pushes, each for itself; a decision
-    and an update take so many times as long."""
+    members: int | None = None
+    """Networks whose mean is the value; None takes as many as `--init-from` has, else one. They start apart and learn
+    from the same pushes, each for itself; a decision and an update take so many times as long."""
+
+    @property
+    def num_members(self) -> int:
+        """Return how many networks there are."""
+        return self.members or 1
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -71,7 +71,7 @@ class EvaluationConfig:
     """One evaluation."""
 
     policy: str
-    """random, guided, straight, clear, lookahead, pretrained, or a run folder; of a run of the preset `ppg` also
+    """random, guided, straight, clear, lookahead, pretrained, cpu-1, or a run folder; of a run of the preset `ppg` also
     target-ppg:FOLDER, and untrained strokes or target-strokes (docs/baselines.md)."""
     assets: AssetsConfig = field(default_factory=AssetsConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)

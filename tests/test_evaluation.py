@@ -237,10 +237,10 @@ def test_files_and_comparisons_say_that_pushes_out_of_reach_were_passed_over(tmp
 
 @pytest.mark.slow
 def test_a_policy_that_takes_reachable_pushes_is_refused_none_by_a_wall(tmp_path: Path) -> None:
-    """`pretrained` ends its first and its third scene in the shelf by a push that a wall forbids."""
+    """`cpu-1` ends its first and its third scene in the shelf by a push that a wall forbids."""
     files = {reachable: tmp_path / f"{reachable}.json" for reachable in ("True", "False")}
     for reachable, file in files.items():
-        arguments = ["--policy", "pretrained", "--workspace", "shelf", "--episodes", "3", "--reachable", reachable]
+        arguments = ["--policy", "cpu-1", "--workspace", "shelf", "--episodes", "3", "--reachable", reachable]
         assert main(["evaluate", *arguments, "--json", str(file)]) == 0
     walls = {r: [row["obstruction"] == "wall" for row in json.loads(f.read_text())["rows"]] for r, f in files.items()}
     assert walls == {"True": [False] * 3, "False": [True, False, True]}

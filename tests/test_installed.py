@@ -75,7 +75,9 @@ def run(*command: str | Path, cwd: Path, **environment: str) -> str:
 def test_files_of_a_release_are_where_they_belong(built: Built):
     wheel, sdist = built.in_wheel(), built.in_sdist()
     everywhere = {"pregrasp_jax/py.typed", "pregrasp_jax/cli/main.py", "pregrasp_jax/report/style.css"}
-    everywhere |= {f"pregrasp_jax/pretrained/{path.name}" for path in (ROOT / "pregrasp_jax" / "pretrained").iterdir()}
+    package = ROOT / "pregrasp_jax"
+    everywhere |= {str(path.relative_to(ROOT)) for path in package.glob("pretrained*/*")}
+    assert len(everywhere) > 10, "three policies"
     assert everywhere <= wheel and everywhere <= sdist
     assert f"pregrasp_jax-{pregrasp_jax.__version__}.dist-info/licenses/LICENSE" in wheel
     assert "pregrasp_jax/mjcf/table.xml" in wheel and "mjcf/table.xml" in sdist

@@ -19,13 +19,14 @@ from pregrasp_jax.config import Config, NetworkConfig
 from pregrasp_jax.learning import learner
 from pregrasp_jax.learning.members import join, split
 from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.training import session
 from pregrasp_jax.types import HandPose, Observation
 
 NETWORK = NetworkConfig(architecture="compact", width=1 / 32, mirror=True)
 CONFIG = Config(network=NETWORK)
 
 
-def of(config: Config, members: int) -> Config:
+def of(config: Config, members: int | None) -> Config:
     return dataclasses.replace(config, network=dataclasses.replace(config.network, members=members))
 
 
@@ -55,6 +56,7 @@ def test_a_value_is_the_mean_of_the_members():
 
 
 def test_members_start_apart_and_fit_only_a_network_of_as_many():
+    assert NETWORK.members is None and NETWORK.num_members == 1
     q = make_q_function(of(CONFIG, 2).network, CONFIG.task, ACTIONS)
     params = jax.jit(q.init)(jax.random.key(0, impl="rbg"))
     first, second = q.networks(params)
@@ -146,3 +148,24 @@ def test_combine_needs_two_policies_and_a_new_folder(tmp_path, capsys):
             main(["combine", *arguments])
         assert named in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "started_from", "found"), [(None, 3, 3), (None, None, None), (2, 3, 2), (2, None, 2)]
+)
+def test_a_training_takes_as_many_networks_as_it_begins_with_unless_it_says_how_many(asked, started_from, found):
+    config = session._as_many_members(of(CONFIG, asked), of(CONFIG, started_from))
+    assert config == of(CONFIG, found)
+
+
+def test_a_training_says_which_settings_give_the_values_another_meaning():
+    changed = dataclasses.replace(
+        CONFIG,
+        learner=dataclasses.replace(CONFIG.learner, discount=0.7, batch_size=8),
+        task=dataclasses.replace(CONFIG.task, approach_reward=0.0),
+    )
+    assert list(session._changed_values(CONFIG, CONFIG)) == []
+    assert list(session._changed_values(changed, CONFIG)) == [
+        "learner.discount = 0.5, this run has 0.7",
+        "task.approach_reward = 0.5, this run has 0.0",
+    ]

@@ -5,10 +5,11 @@ import json
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.checkpoint import load_policy
-from pregrasp_jax.checkpoint.policy import PRETRAINED, SHIPPED
+from pregrasp_jax.checkpoint.policy import SHIPPED
 from pregrasp_jax.config import Config
 from pregrasp_jax.learning.imitation import StrokeFunction
 from pregrasp_jax.learning.q_function import make_q_function
@@ -18,9 +19,14 @@ from pregrasp_jax.task.push_grasp import stroke_actions
 from pregrasp_jax.types import Observation
 
 
-def test_it_is_small_and_fits_its_network():
-    assert sum(file.stat().st_size for folder in SHIPPED.values() for file in folder.iterdir()) <= 3_000_000
-    policy = load_policy("pretrained")
+@pytest.mark.parametrize("name", SHIPPED)
+def test_it_is_small(name):
+    assert sum(file.stat().st_size for file in SHIPPED[name].iterdir()) <= 3_000_000
+
+
+@pytest.mark.parametrize("name", ["pretrained", "cpu-1"])
+def test_it_fits_its_network(name):
+    policy = load_policy(name)
     robot = get_robot(policy.config.task.robot)
     q = make_q_function(policy.config.network, policy.config.task, push_actions(robot))
     assert q.fits(policy.params)
@@ -31,13 +37,14 @@ def test_it_is_small_and_fits_its_network():
     assert np.isfinite(values).all() and 0.05 < np.ptp(np.asarray(values)) < 4, "trained, and within 0 to 4 or so"
 
 
-def test_its_evaluation_is_of_these_objects():
-    document = json.loads((PRETRAINED / "test_scenes.json").read_text())
+@pytest.mark.parametrize("name", ["pretrained", "cpu-1"])
+def test_its_evaluation_is_of_these_objects(name):
+    document = json.loads((SHIPPED[name] / "test_scenes.json").read_text())
     assert document["hull_bank_hash"] == builtin_bank("seen").content_hash
     assert document["episodes"] == 200 and document["object_set"] == "seen"
     assert document["success_rate"] == np.mean([row["success"] for row in document["rows"]])
-    assert document["policy"] == "pretrained" and len(document["rows"]) == 200
-    trained, evaluated = load_policy("pretrained").config, Config.from_dict(document["config"])
+    assert document["policy"] == name and len(document["rows"]) == 200
+    trained, evaluated = load_policy(name).config, Config.from_dict(document["config"])
     assert evaluated.network == trained.network and evaluated.task == trained.task
 
 

@@ -40,7 +40,7 @@ def combine(policies: Sequence[Path | str], folder: Path) -> TrainedPolicy:
                     f"{path} has {name} = {value}, but {policies[0]} {wanted[name]}: the mean of their values would "
                     f"mean nothing; allowed are policies of one network, task and discount"
                 )
-    networks = [params for policy in loaded for params in split(policy.params, policy.config.network.members)]
+    networks = [params for policy in loaded for params in split(policy.params, policy.config.network.num_members)]
     most = int(RANGES["network.members"][1])
     if len(networks) > most:
         raise ValueError(f"the policies have {len(networks)} networks together; allowed are {most}")

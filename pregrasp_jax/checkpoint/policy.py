@@ -32,11 +32,12 @@ PPG = "ppg"
 
 _PACKAGE = Path(__file__).parent.parent
 
-SHIPPED = {"pretrained": _PACKAGE / "pretrained", PPG: _PACKAGE / "pretrained_ppg"}
-"""Folders of the policies that ship with the package."""
-
-PRETRAINED = SHIPPED["pretrained"]
-"""The one of the paper's method."""
+SHIPPED = {
+    "pretrained": _PACKAGE / "pretrained",
+    "cpu-1": _PACKAGE / "pretrained_cpu",
+    PPG: _PACKAGE / "pretrained_ppg",
+}
+"""Folders of the policies that ship with the package: those that `config.PUSHING` names, and the one of strokes."""
 
 _PARAMS = "params.safetensors"
 BUNDLED = "policy.safetensors"

@@ -74,11 +74,10 @@ def combine(policies: tuple[str, ...], /, *, out: Path) -> None:
     Args:
         policies: two or more of one network, task and discount: run folders (the best policy of a run), their
             folders `checkpoints` (the latest), policy folders, or pretrained.
-        out: folder of the new policy. It is evaluated, exported and trained on (`train ... --init-from OUT
-            --network.members N`) like any other.
+        out: folder of the new policy. It is evaluated, exported and trained on like any other.
     """
     policy = combine_policies(policies, out)
-    print(f"wrote {out}: the mean of {policy.config.network.members} networks")
+    print(f"wrote {out}: the mean of {policy.config.network.num_members} networks")
 
 
 def compare(a: Path, b: Path, /, *, across_workspaces: bool = False, json: Path | None = None) -> None:

@@ -12,7 +12,7 @@ import jax
 
 from pregrasp_jax.checkpoint import TrainedPolicy, load_policy
 from pregrasp_jax.checkpoint.policy import PPG
-from pregrasp_jax.config import STYLES, Config, PlaceConfig, TaskConfig, with_absolute_paths
+from pregrasp_jax.config import PUSHING, STYLES, Config, PlaceConfig, TaskConfig, with_absolute_paths
 from pregrasp_jax.evaluation import EpisodeCallback, Evaluator, evaluation_document, learned
 from pregrasp_jax.evaluation_config import EvaluationConfig, PlanningConfig, StrokesOverrides, TaskOverrides
 from pregrasp_jax.machine import announced_compilation
@@ -189,7 +189,7 @@ def refuse_unknown_policy(spec: str, *, key: str) -> None:
     Raises:
         ValueError: there is no such policy.
     """
-    names = [*scripts.SCRIPTS, *STROKE_SCRIPTS, "pretrained", *STYLES]
+    names = [*scripts.SCRIPTS, *STROKE_SCRIPTS, *PUSHING, *STYLES]
     if spec not in names and not Path(_named(spec)[0]).exists():
         raise ValueError(f"{key} {spec} does not exist; allowed: {', '.join(names)}, or a run folder")
 

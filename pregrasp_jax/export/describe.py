@@ -230,7 +230,7 @@ def _training(policy: TrainedPolicy) -> Training:
         architecture=config.network.architecture,
         width=config.network.width,
         mirror=config.network.mirror,
-        members=config.network.members,
+        members=config.network.num_members,
         parameters=num_parameters(policy.params),
         config=to_dict(config),
     )

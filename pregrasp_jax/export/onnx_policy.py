@@ -69,7 +69,7 @@ def _paper_values(graph: Graph, params: Params, config: Config, actions: ActionS
         return _conv(graph, x, params["readout"])
 
     def values(images: str) -> str:
-        x = _mean(graph, [readout(images, member) for member in split(params, config.network.members)])
+        x = _mean(graph, [readout(images, member) for member in split(params, config.network.num_members)])
         return graph("Transpose", _upsample(graph, x, SIZE // 2, SIZE // 2, 1), perm=[0, 2, 3, 1])
 
     if not config.network.mirror:
@@ -108,7 +108,7 @@ def _compact_values(graph: Graph, params: Params, config: Config, actions: Actio
             x = _relu(graph, graph("Add", x, _conv(graph, hidden, params[f"block{index}_out"])))
         return _conv(graph, x, params["readout"])
 
-    q = _mean(graph, [readout(x, member) for member in split(params, config.network.members)])
+    q = _mean(graph, [readout(x, member) for member in split(params, config.network.num_members)])
     q = _upsample(graph, q, (rows - 1) // PATCH, cols // PATCH, int(math.log2(PATCH)))
     q = graph("Transpose", q, perm=[0, 2, 3, 1])
     q = graph("Reshape", q, np.array([0, (rows - 1) * cols, actions.num_choices]))

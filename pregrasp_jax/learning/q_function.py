@@ -113,7 +113,7 @@ def make_q_function(network: NetworkConfig, task: TaskConfig, actions: ActionSpa
     if network.architecture == "paper":
         mirror_fn = mirror_images if network.mirror else None
         paper = QNetwork(width=network.width, **common)
-        return QFunction(paper, actions, network_input, mirror_fn, members=network.members)
+        return QFunction(paper, actions, network_input, mirror_fn, members=network.num_members)
     channels, size = max(1, round(_COMPACT_CHANNELS * network.width)), window_size(task)
     return QFunction(
         CompactNetwork(channels=channels, **common),
@@ -121,7 +121,7 @@ def make_q_function(network: NetworkConfig, task: TaskConfig, actions: ActionSpa
         functools.partial(look_around_hand, size=size),
         mirror_window if network.mirror else None,
         functools.partial(cells_around_hand, size=size),
-        network.members,
+        network.num_members,
     )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from pregrasp_jax.config import STYLES, Config, TaskConfig
+from pregrasp_jax.config import PUSHING, STYLES, Config, TaskConfig
 from pregrasp_jax.evaluation import load_evaluation
 from pregrasp_jax.evaluation.statistics import compare, decides_alone, policy_name, workspace_of
 from pregrasp_jax.report.markup import Markup, element
@@ -61,7 +61,7 @@ def load_evaluations(run: RunRecord, files: Sequence[Path] = ()) -> list[dict[st
 
 def is_of_run(run: RunRecord, document: dict[str, Any]) -> bool:
     """Return whether a run's policy was evaluated: it goes by the folder's name, wherever that was then."""
-    of_package = (*BASELINES, "pretrained", *STYLES)
+    of_package = (*BASELINES, *PUSHING, *STYLES)
     return document["policy"] not in of_package and Path(document["policy"]).name == run.name
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from pregrasp_jax.config import PUSHING
 from pregrasp_jax.evaluation_config import EvaluationConfig
 from pregrasp_jax.settings import from_dict, to_dict
 from pregrasp_jax.spaces.workspace import WORKSPACES, get_workspace
@@ -100,7 +101,7 @@ def _names(spec: Spec) -> Iterator[str]:
         if variant.policy is not None and (variant.settings or variant.init_from):
             yield f"variants.{name} names a policy, which is not trained; allowed beside it is nothing"
         start = variant.init_from
-        if start is not None and start != "pretrained" and not Path(start).exists():
+        if start is not None and start not in PUSHING and not Path(start).exists():
             yield f"variants.{name}.init_from = {start!r} does not exist; allowed: pretrained, a run or a policy folder"
 
 

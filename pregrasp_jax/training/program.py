@@ -201,8 +201,8 @@ def make_program(
     if params is not None and not q.fits(params):
         raise ValueError(
             f"the initial parameters (--init-from) are of another network; allowed is network.architecture = "
-            f"{config.network.architecture}, network.width = {config.network.width} and network.members = "
-            f"{config.network.members}"
+            f"{config.network.architecture} and network.width = {config.network.width}, and network.members = "
+            f"{config.network.num_members}"
         )
     remember = make_remember(config.replay, env.rules)
     return Program(init, collect, remember, update, env.rules.successes, pace, _num_fused(config), layout=layout)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from pregrasp_jax.evaluation import Evaluator
 from pregrasp_jax.evaluation.clearing import own_protocol
 from pregrasp_jax.learning.q_function import Params, make_q_function
 from pregrasp_jax.policies.learned import make_learned
-from pregrasp_jax.settings import to_dict
+from pregrasp_jax.settings import flatten, to_dict
 from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.assembly import make_env
 from pregrasp_jax.task.env import Env
@@ -29,6 +29,9 @@ from pregrasp_jax.training.recorder import EvaluateFn, Recorder
 from pregrasp_jax.training.run_folder import RunFolder, WatchedFolder, refuse_used
 from pregrasp_jax.training.sharding import make_layout
 from pregrasp_jax.training.trainer import CompileFn, Trainer
+
+VALUES_DEPEND_ON = ("learner.discount", "task.in_region_reward", "task.approach_reward")
+"""Settings that decide what a value means."""
 
 VALIDATION_ENVS = 16
 """Validation scenes side by side; the result does not depend on it."""
@@ -54,8 +57,29 @@ def train(config: Config, run_dir: Path, *, init_from: Path | None = None, conso
     prepare()
     if processes.is_first():
         refuse_used(run_dir)
-    params = None if init_from is None else load_policy(init_from).params
-    return _session(with_absolute_paths(config), run_dir, None, params, console or _console())
+    console, config, params = console or _console(), with_absolute_paths(config), None
+    if init_from is not None:
+        policy = load_policy(init_from)
+        config, params = _as_many_members(config, policy.config), policy.params
+        for line in _changed_values(config, policy.config):
+            console.say(f"{init_from} was trained with {line}: its values will change")
+    return _session(config, run_dir, None, params, console)
+
+
+def _as_many_members(config: Config, started_from: Config) -> Config:
+    """Return a configuration with as many networks as that of the initial parameters, unless it says how many."""
+    if config.network.members is not None or started_from.network.num_members == 1:
+        return config
+    members = started_from.network.members
+    return dataclasses.replace(config, network=dataclasses.replace(config.network, members=members))
+
+
+def _changed_values(config: Config, started_from: Config) -> Iterator[str]:
+    """Yield what makes a value mean something else than where the parameters come from."""
+    now, before = flatten(to_dict(config)), flatten(to_dict(started_from))
+    for name in VALUES_DEPEND_ON:
+        if now[name] != before[name]:
+            yield f"{name} = {before[name]}, this run has {now[name]}"
 
 
 def resume(config: Config, run_dir: Path, *, console: Console | None = None) -> int:
