@@ -61,7 +61,7 @@ COMMAND_LINES = [
     ),
     (
         "pregrasp_jax dokter",
-        "Unrecognized options: dokter (Available subcommands: assets, calibrate-check, compare, contract, ",
+        "Unrecognized options: dokter (Available subcommands: assets, calibrate-check, combine, compare, contract, ",
         "scenes, show, sweep, train, verify)",
     ),
     ("pregrasp_jax demo --episodes 0 --run-dir {w}/new", "episodes = 0 is out of range; allowed is 1 and more"),

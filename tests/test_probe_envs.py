@@ -49,6 +49,7 @@ def table_at(params: jax.Array, inputs: jax.Array, action: jax.Array) -> jax.Arr
 TABLE: Any = SimpleNamespace(
     apply=table_network,
     at=table_at,
+    networks=lambda params: [params],
     input_fn=network_input,
     augment=lambda key, inputs, action: (inputs, action),
 )
