@@ -77,7 +77,9 @@ class TinyNetwork(nn.Module):
 
 
 def make_program(config: Config, env: Any = None, **options: Any) -> program.Program:
-    q_function = QFunction(TinyNetwork(width=config.network.width), ACTIONS, input_fn)
+    q_function = QFunction(
+        TinyNetwork(width=config.network.width), ACTIONS, input_fn, members=config.network.num_members
+    )
     scenes: Any = env or PictureEnv()
     return program.make_program(scenes, config, q_function=q_function, **options)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from fake_training import (
     PictureEnv,
@@ -23,6 +24,7 @@ from fake_training import (
 from pregrasp_jax.checkpoint import checksum, load_policy
 from pregrasp_jax.config import ExplorationConfig
 from pregrasp_jax.learning import learner
+from pregrasp_jax.learning.members import split
 from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.training import learn
@@ -76,6 +78,25 @@ def test_interrupted_and_resumed_equals_uninterrupted(tmp_path, finished):
     second = run(path, finished.config, resume=True)
     assert checksum(second.state) == checksum(finished.state)
     assert timeless(path) == timeless(finished.recorder.folder.path)
+
+
+def test_a_run_of_several_networks_that_learn_by_muon_is_resumed_as_if_it_had_not_stopped(tmp_path):
+    config = make_config(episodes=12)
+    config = dataclasses.replace(
+        config,
+        network=dataclasses.replace(config.network, members=2),
+        learner=dataclasses.replace(config.learner, optimizer="muon"),
+    )
+    whole = run(tmp_path / "whole", config)
+    begun = jax.tree.map(np.asarray, make_trainer(tmp_path / "other", config).state.learning.learner.params)
+    run(tmp_path / "halves", config, stop=stop_after(5))
+    resumed = run(tmp_path / "halves", config, resume=True)
+    assert checksum(resumed.state) == checksum(whole.state)
+    assert timeless(tmp_path / "halves") == timeless(tmp_path / "whole")
+    learned = load_policy(tmp_path / "whole").params
+    for member in range(2):
+        before, after = (split(params, 2)[member]["conv"]["kernel"] for params in (begun, learned))
+        assert np.abs(after - before).max() > 1e-6, f"network {member} has learned nothing"
 
 
 def test_resume_repeats_what_a_crash_lost(tmp_path, finished):
