@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax import heightmap
-from pregrasp_jax.config import Config
+from pregrasp_jax.config import AssetsConfig, Config, SceneConfig
 from pregrasp_jax.deploy.build import make_decider, nominal_view
 from pregrasp_jax.deploy.bundle import Bundle
 from pregrasp_jax.deploy.cell import Cell
@@ -127,19 +127,19 @@ class SimulatedCell:
 
 
 def make_programs(bundle: Bundle, cell: Cell) -> Programs:
-    """Return the environment that a policy was trained for, with the objects and the sensor of a cell.
+    """Return the task that a policy was trained for, with the objects and the sensor of a cell.
+
+    Objects, scenes and engine are those of `evaluate`, whatever the training had: both meet the same test scenes.
 
     Raises:
         ValueError: something of it cannot be used.
     """
     prepare()
     config, sim = Config.from_dict(bundle.contract.training.config), cell.sim
-    config = dataclasses.replace(
-        config,
+    config = Config(
         task=dataclasses.replace(config.task, camera="pinhole", sensor=sim.sensor),
-        assets=dataclasses.replace(config.assets, object_set=sim.object_set, object_dir=sim.object_dir),
-        # As many scenes as `evaluate` packs by default, so that both meet the same ones.
-        scene=dataclasses.replace(config.scene, test_scenes=max(200, sim.scene + 1)),
+        assets=AssetsConfig(object_set=sim.object_set, object_dir=sim.object_dir),
+        scene=SceneConfig(test_scenes=max(SceneConfig().test_scenes, sim.scene + 1)),
     )
     return Programs(make_env(config.validate(), split="test"))
 

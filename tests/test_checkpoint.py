@@ -275,12 +275,21 @@ def test_every_byte_of_a_policy_matters(tmp_path):
     assert policy.load_policy(path).config == PRESETS["ci"]
 
 
+def test_parameters_that_are_not_finite_are_refused(tmp_path):
+    params = make_params(5)
+    params["conv"]["bias"] = jnp.array([0.0, jnp.nan])
+    policy.save_policy(tmp_path, params, PRESETS["ci"], {})
+    with pytest.raises(ValueError, match=r"params\.safetensors: conv/bias has values that are not finite.*; allowed"):
+        policy.load_policy(tmp_path)
+
+
 def test_a_run_without_best_policy_gives_its_latest_checkpoint(tmp_path):
     checkpoints = tmp_path / "checkpoints"
     write_config(tmp_path / "config.yaml", Config())
     save(checkpoints, 1, 4)
     flip_byte(save(checkpoints, 2, 9) / "state.safetensors")
-    loaded = policy.load_policy(tmp_path)
+    with pytest.warns(UserWarning, match=r"000000002.state\.safetensors is cut.*; the policy of 000000001 is used"):
+        loaded = policy.load_policy(tmp_path)
     assert trees.checksum(loaded.params) == trees.checksum(make_params(1))
     assert (checkpoints / "000000002").is_dir(), "reading a policy must not change the run"
 

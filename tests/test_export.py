@@ -14,6 +14,8 @@ import onnxruntime
 import pytest
 from bundles import ACTIONS, random_params, random_policy, small_bundle
 
+from pregrasp_jax.checkpoint import checksum, load_policy, state, write_config
+from pregrasp_jax.checkpoint.chunks import Ring
 from pregrasp_jax.cli.main import main
 from pregrasp_jax.config import Config, NetworkConfig, TaskConfig
 from pregrasp_jax.deploy.bundle import check_contract, read_bundle
@@ -25,6 +27,7 @@ from pregrasp_jax.export.onnx_policy import make_onnx
 from pregrasp_jax.export.stablehlo import policy_function
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.spaces.actions import ActionSpace, Choice
+from pregrasp_jax.training.program import POLICY
 
 RNG = np.random.default_rng(0)
 PLACES = np.array([[-0.3, 0.0], [-0.2475, 0.1025], [0.0, 0.0], [0.245, -0.245], [0.4, 0.3]], np.float32)
@@ -102,6 +105,22 @@ def test_a_bundle_is_verified(bundle: Path, capsys):
     said = capsys.readouterr().out
     assert said.count(" ok ") == 5 and "FAILED" not in said, said
     assert "heightmaps" in said and "stablehlo_batch" in said
+
+
+def test_the_latest_checkpoint_of_a_run_is_exported_as_a_policy(tmp_path: Path):
+    """Of a checkpoint only the policy, without the rest of the training, and without a claim of what it can do."""
+    config = Config(network=NetworkConfig(architecture="compact", width=1 / 32))
+    params = random_params(make_q_function(config.network, config.task, ACTIONS))
+    write_config(tmp_path / "config.yaml", config)
+    tree = {"learning": {"learner": {"target_params": params}}, "rest": np.zeros(10_000)}
+    state.save(tmp_path / "checkpoints", 7, tree, Ring({"height": np.zeros((1, 2), np.uint8)}, 0), {}, policy=POLICY)
+    contract = export_policy(
+        load_policy(tmp_path / "checkpoints"), tmp_path / "bundle", formats=["safetensors"], golden=2
+    )
+    exported = load_policy(tmp_path / "bundle")
+    assert checksum(exported.params) == checksum(params) and exported.config == config
+    assert (contract.training.origin, contract.evaluation) == ("000000007", {})
+    assert main(["verify", str(tmp_path / "bundle")]) == 0
 
 
 def test_another_policy_in_the_graph_is_found(bundle: Path, tmp_path: Path, capsys):

@@ -56,7 +56,7 @@ class TrainedPolicy:
         params: parameters of the network, nested dicts of device arrays.
         config: of the run that trained it.
         evaluation: what was measured on the validation scenes when it was saved; may be empty.
-        origin: the file that it was read from.
+        origin: the file that it was read from, or the folder of the checkpoint.
     """
 
     params: Any
@@ -86,7 +86,7 @@ def load_policy(path: Path | str) -> TrainedPolicy:
     those of policies that ship with the package.
 
     Raises:
-        ValueError: nothing there, damaged, or not written by `save_policy`; one line says which.
+        ValueError: nothing there, damaged, not finite, or not written by `save_policy`; one line says which.
     """
     path = SHIPPED.get(str(path), Path(path))
     for candidate in (path, path / _PARAMS, path / "best" / _PARAMS, path / BUNDLED):
@@ -116,7 +116,7 @@ def _read_policy(path: Path) -> TrainedPolicy:
         evaluation = json.loads(metadata["evaluation"])
     except ValueError as error:
         raise ValueError(f"{path} was written by another version of this package: {error}") from None
-    return TrainedPolicy(trees.nest(arrays), config, evaluation, path)
+    return _policy(arrays, config, evaluation, path)
 
 
 def _checksum(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
@@ -129,4 +129,13 @@ def _checksum(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> 
 
 def _policy_of_checkpoint(folder: Path, config: Config) -> TrainedPolicy:
     params, origin = read_newest_policy(folder)
-    return TrainedPolicy(trees.nest(params), config, {}, origin)
+    return _policy(params, config, {}, origin)
+
+
+def _policy(
+    arrays: Mapping[str, np.ndarray], config: Config, evaluation: dict[str, Any], origin: Path
+) -> TrainedPolicy:
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"{origin}: {name} has values that are not finite, with which no push can be chosen")
+    return TrainedPolicy(trees.nest(arrays), config, evaluation, origin)

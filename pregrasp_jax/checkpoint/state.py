@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import shutil
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -173,19 +174,25 @@ def _settle_for(path: Path, damaged: dict[Path, str], template: Any, ring_templa
 
 
 def read_newest_policy(folder: Path) -> tuple[dict[str, np.ndarray], Path]:
-    """Return the parameters of the newest intact checkpoint by name, and its file; changes nothing on disk.
+    """Return the parameters of the newest intact checkpoint by name, and its folder; changes nothing on disk.
+
+    Warns of newer ones that are damaged.
 
     Raises:
         ValueError: there is none.
     """
+    damaged: list[str] = []
     for path in _newest_first(folder):
         try:
             manifest = _read_manifest(path)
             arrays, prefix = _read_state(path, manifest), manifest.get("policy", _FIRST_POLICY)
             named = {name.removeprefix(prefix): leaf for name, leaf in arrays.items() if name.startswith(prefix)}
-            return named, path / _STATE
-        except DamagedFileError:
+        except DamagedFileError as error:
+            damaged.append(str(error))
             continue
+        for problem in damaged:
+            warnings.warn(f"{problem}; the policy of {path.name} is used", stacklevel=3)
+        return named, path
     raise ValueError(f"{folder} holds no intact checkpoint")
 
 

@@ -238,7 +238,7 @@ def format_contract(contract: Contract) -> str:
         "",
         "## Evaluation",
         "",
-        *(f"* {key}: {value}" for key, value in contract.evaluation.items()),
+        *([f"* {key}: {value}" for key, value in contract.evaluation.items()] or ["None came with the policy."]),
         "",
         "## Not guaranteed",
         "",

@@ -48,6 +48,10 @@ def export_policy(
         ValueError: the folder holds something, or an argument is not allowed; one line says which.
     """
     _refuse(folder, formats, golden, force)
+    if policy.config.train.method != "q_learning":
+        raise ValueError(
+            f"policy {policy.origin} has learnt by {policy.config.train.method}; allowed are policies of Q-learning"
+        )
     task = policy.config.task
     robot, workspace = get_robot(task.robot), get_workspace(task.workspace)
     kind = registry.get_kind(task.primitive)

@@ -239,10 +239,11 @@ def _training(policy: TrainedPolicy) -> Training:
 def _evaluation(policy: TrainedPolicy) -> dict[str, Any]:
     """Return what was measured when the policy was saved, with an interval where it says how many scenes there were."""
     found = dict(policy.evaluation)
-    rate, episodes = found.get("success_rate"), policy.config.scene.validation_scenes
-    if isinstance(rate, float) and "success_ci95" not in found:
-        found["success_ci95"] = list(wilson_interval(round(rate * episodes), episodes))
-    found.setdefault("scenes", f"{episodes} validation scenes of set {policy.config.assets.object_set}")
+    rate, episodes, assets = found.get("success_rate"), policy.config.scene.validation_scenes, policy.config.assets
+    if isinstance(rate, float):
+        objects = "made objects" if assets.variants else f"set {assets.object_set}"
+        found.setdefault("scenes", f"{episodes} validation scenes of {objects}")
+        found.setdefault("success_ci95", list(wilson_interval(round(rate * episodes), episodes)))
     return found
 
 

@@ -1,0 +1,51 @@
+"""The cell in simulation meets what an evaluation meets, whatever a policy was trained on."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+from bundles import random_policy
+
+from pregrasp_jax import simulated_cell
+from pregrasp_jax.config import AssetsConfig, Config, NetworkConfig, PhysicsConfig, SceneConfig, TaskConfig
+from pregrasp_jax.deploy.bundle import read_bundle
+from pregrasp_jax.deploy.cell import Cell, SimSettings
+from pregrasp_jax.evaluation import player
+from pregrasp_jax.evaluation_config import EvaluationConfig, TaskOverrides
+from pregrasp_jax.export.bundle import export_policy
+
+
+class Asked(Exception):
+    """The configuration of an environment that is not built."""
+
+
+def ask(config: Config, *, split: str) -> None:
+    raise Asked(config, split)
+
+
+@pytest.mark.parametrize("scene", [0, 250])
+def test_objects_and_scenes_are_those_of_an_evaluation(scene, tmp_path: Path, monkeypatch):
+    trained = Config(
+        network=NetworkConfig(architecture="compact", width=1 / 32),
+        task=TaskConfig(approach_reward=0.0, workspace="shelf"),
+        assets=AssetsConfig(variants=150),
+        scene=SceneConfig(bank_seed=41, train_scenes=64, test_scenes=8),
+        physics=PhysicsConfig(engine="mjx"),
+    )
+    policy = random_policy(tmp_path / "policy", trained)
+    export_policy(policy, tmp_path / "bundle", formats=["safetensors"], golden=2)
+    cell = dataclasses.replace(Cell(), sim=SimSettings(scene=scene, object_set="unseen", sensor="d455"))
+    monkeypatch.setattr(simulated_cell, "make_env", ask)
+    with pytest.raises(Asked) as asked:
+        simulated_cell.make_programs(read_bundle(tmp_path / "bundle"), cell)
+    found, split = asked.value.args
+    request = EvaluationConfig(
+        policy="x",
+        assets=AssetsConfig(object_set="unseen"),
+        task=TaskOverrides(camera="pinhole", sensor="d455"),
+        episodes=scene + 1,
+    )
+    wanted = player._environment_config(request, trained)
+    assert split == "test"
+    for name in ("task", "assets", "scene", "physics"):
+        assert getattr(found, name) == getattr(wanted, name), name
