@@ -50,7 +50,7 @@ class PlanningConfig:
     budget_ms: float = 0.0
     """ms for a decision: no round of simulations begins that would exceed it. 0 sets no limit, and results repeat."""
     candidates: int = 8
-    """Pushes that the network proposes, 2 cm apart; scripts add to them up to 12."""
+    """Pushes that the network proposes, 2 cm apart; scripts add up to 8, and to 12 in all."""
     variants: int = 6
     """Most rebuilt scenes in which a push is tried; all but the first have other poses, sides, masses and friction."""
     depth: int = 2
@@ -90,6 +90,27 @@ class EvaluationConfig:
     """Seed of the policy's own randomness; scenes, yaws and targets are fixed."""
     num_envs: int = 0
     """Scenes side by side, 0 chooses; with `native` results do not depend on it."""
+
+    def validate(self) -> "EvaluationConfig":
+        """Return self.
+
+        Raises:
+            ValueError: a number is out of range, or two settings contradict each other; one line says which.
+        """
+        if self.num_envs < 0:
+            raise ValueError(
+                f"num_envs = {self.num_envs} is out of range; allowed is 1 and more, or 0 to let it choose"
+            )
+        if self.episodes < 1:
+            raise ValueError(f"episodes = {self.episodes} is out of range; allowed is 1 and more")
+        if self.plan and self.reachable:
+            raise ValueError(
+                "reachable = True: plan = True takes no push that is out of reach; allowed is one of the two"
+            )
+        if not self.plan and self.planning != PlanningConfig():
+            raise ValueError("planning.* is set, but plan = False; allowed is plan = True with it")
+        self.planning.validate()
+        return self
 
 
 _PLANNING_RANGES: dict[str, tuple[float, float]] = {

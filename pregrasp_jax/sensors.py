@@ -128,7 +128,7 @@ def get_sensor(name: str) -> Sensor:
     if not isinstance(values, Mapping):
         raise ValueError(f"{path}: a sensor must be a mapping; allowed keys: base, {', '.join(_fields())}")
     base = values.get("base", "clean")
-    if base not in SENSORS:
+    if not isinstance(base, str) or base not in SENSORS:
         raise ValueError(f"{path}: base = {base!r} does not exist; allowed: {', '.join(SENSORS)}")
     settings = dataclasses.asdict(SENSORS[base]) | {key: value for key, value in values.items() if key != "base"}
     try:

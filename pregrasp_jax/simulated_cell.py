@@ -167,11 +167,12 @@ def make_simulated_station(
     if cell.sim.scene < 0:
         raise ValueError(f"sim.scene = {cell.sim.scene} is out of range; allowed is 0 and more")
     decider = make_decider(bundle, cell)
+    decisions = DecisionLog(log, bundle.contract) if log else None
     scene = SimulatedCell(programs or make_programs(bundle, cell), cell.sim.scene)
     return Station(
         decider=decider,
         cell=cell.runtime.cell or bundle.contract.camera.cell,
-        log=DecisionLog(log, bundle.contract) if log else None,
+        log=decisions,
         say=say,
         view=nominal_view(bundle.contract.camera),
         source=scene,

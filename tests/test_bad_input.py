@@ -60,6 +60,10 @@ COMMAND_LINES = [
         "train.tight_targets = 3 is not known to train.method = imitation; allowed is 1",
     ),
     (
+        "train ppg --run-dir {w}/new --learner.optimizer muon",
+        "learner.optimizer = muon is not known to train.method = imitation; allowed is to leave it at adam",
+    ),
+    (
         "pregrasp_jax dokter",
         "Unrecognized options: dokter (Available subcommands: assets, calibrate-check, combine, compare, contract, ",
         "scenes, show, sweep, train, verify)",
@@ -94,6 +98,7 @@ RUNS = [
     ("train resume {w}/typo", "{w}/typo/config.yaml: unknown config key sead; allowed here: assets, exploration"),
     ("train resume {w}/range", "{w}/range/config.yaml: task.r_in = 3.0 is out of range; allowed is 0.005 to 0.5"),
     ("train resume {w}/run --seed 4", "a changed configuration (seed: 0 -> 4); allowed to change: train.minutes"),
+    ("pregrasp_jax demo --run-dir {w}/run", "a changed configuration (", "allowed to change: train.minutes"),
     (
         "train resume {w}/other",
         "run {w}/other began with another hull bank (of yesterday, now hulls); resume it with the",

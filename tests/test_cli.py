@@ -318,7 +318,10 @@ def test_assets_lists_and_draws_a_folder(run: Any, tmp_path: Path, monkeypatch: 
     assert image.ndim == 3 and image.std() > 5
     code, out, err = run("assets", str(folder), "--variants", "2", "--png", str(png))
     assert code == 0, err
-    assert "made_0001" in out and "2 objects" in out and "millimetres" not in out
+    assert "made_0001" in out and "2 objects" in out and "refused: millimetres.stl" in out
+    (folder / "carton.stl").unlink()
+    code, _, err = run("assets", str(folder), "--variants", "2", "--png", str(png))
+    assert code == 2 and "none of the 1 meshes of 'seen' is usable, so none can be made beside them" in err
     code, _, err = run("assets", "--variants", "-1", "--png", str(png))
     assert code == 2 and "assets.variants = -1 is out of range; allowed is 0 to 10000" in err
 

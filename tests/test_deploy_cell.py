@@ -11,6 +11,7 @@ from bundles import SMALL, small_bundle
 from PIL import Image
 
 from pregrasp_jax.cli.main import main
+from pregrasp_jax.deploy.cell import read_cell
 
 ROOT = Path(__file__).parent.parent
 INTRINSICS = [[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]
@@ -69,6 +70,13 @@ def test_a_dry_trial_is_decided_logged_and_drawn(tmp_path: Path, capsys):
         with pytest.raises(SystemExit) as stopped:
             main(options)
         assert stopped.value.code == 2 and problem in capsys.readouterr().err
+
+
+def test_what_is_simulated_is_found_from_where_the_cell_is_written(tmp_path: Path):
+    cell = write_cell(tmp_path, sim={"object_dir": "meshes", "sensor": "mine.yaml"})
+    sim = read_cell(cell).sim
+    assert (sim.object_dir, sim.sensor) == (str(tmp_path / "meshes"), str(tmp_path / "mine.yaml"))
+    assert read_cell(write_cell(tmp_path, sim={"sensor": "d455"})).sim.sensor == "d455"
 
 
 @pytest.mark.parametrize(

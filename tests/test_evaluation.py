@@ -235,6 +235,22 @@ def test_files_and_comparisons_say_that_pushes_out_of_reach_were_passed_over(tmp
         results.load_evaluation(tmp_path / "e.json")
 
 
+def test_files_and_comparisons_say_what_was_seen_and_how_it_was_counted(tmp_path: Path) -> None:
+    plain = _document()
+    sensor = {"name": "cell.yaml", "subpixel": 0.1}
+    noisy = plain | {"camera": "pinhole", "sensor": sensor, "config": {"task": {"obstacles_may_leave": True}}}
+    assert "(table, obstacles may leave, native physics, pinhole camera, sensor cell.yaml, seed 4" in (
+        results.format_evaluation(noisy)
+    )
+    assert "(table, native physics, orthographic camera, seed 4" in results.format_evaluation(plain)
+    edited = noisy | {"sensor": sensor | {"subpixel": 0.05}}
+    assert compare(noisy, edited).settings == ("sensor.subpixel: 0.1 | 0.05",)
+    for key, damaged in (("sensor", "d455"), ("planning", {"settings": 3})):
+        (tmp_path / "e.json").write_text(json.dumps(plain | {key: damaged}))
+        with pytest.raises(ValueError, match=rf"damaged evaluation \({key}\)"):
+            results.load_evaluation(tmp_path / "e.json")
+
+
 @pytest.mark.slow
 def test_a_policy_that_takes_reachable_pushes_is_refused_none_by_a_wall(tmp_path: Path) -> None:
     """`cpu-1` ends its first and its third scene in the shelf by a push that a wall forbids."""

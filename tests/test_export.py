@@ -179,7 +179,7 @@ def test_a_contract_reads_as_text():
     assert "None" not in text and "nan" not in text
 
 
-def test_a_folder_with_something_in_it_is_refused(tmp_path: Path, bundle: Path):
+def test_a_folder_with_something_in_it_is_refused(tmp_path: Path, bundle: Path, monkeypatch):
     policy = random_policy(tmp_path / "policy", Config(network=NetworkConfig(architecture="compact", width=1 / 32)))
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("years")
@@ -188,6 +188,12 @@ def test_a_folder_with_something_in_it_is_refused(tmp_path: Path, bundle: Path):
             export_policy(policy, tmp_path / "full", force=force)
     with pytest.raises(ValueError, match="is not empty"):
         export_policy(policy, bundle)
+    with monkeypatch.context() as inside, pytest.raises(ValueError, match="is where the program runs"):
+        (tmp_path / "here").mkdir()
+        inside.chdir(tmp_path / "here")
+        export_policy(policy, Path())
+    with pytest.raises(ValueError, match="has learnt by imitation; allowed are policies of Q-learning"):
+        export_policy(load_policy("ppg"), tmp_path / "new")
     with pytest.raises(ValueError, match="golden = 1 is out of range"):
         export_policy(policy, tmp_path / "new", golden=1)
     with pytest.raises(ValueError, match="allowed are some of safetensors, onnx, stablehlo"):

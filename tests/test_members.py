@@ -118,6 +118,7 @@ def test_combined_policies_have_the_mean_of_their_values(tmp_path, capsys):
         ({"learner.discount": 0.7}, "learner.discount = 0.7"),
         ({"network.width": 1 / 16}, "network.width = 0.0625"),
         ({"network.mirror": False}, "network.mirror = False"),
+        ({"train.try_grasps": True}, "train.try_grasps = True"),
         ({"train.method": "imitation"}, "learnt by imitation"),
     ],
 )
@@ -137,10 +138,16 @@ def test_values_that_mean_something_else_are_not_averaged(change, named, tmp_pat
 
 def test_combine_needs_two_policies_and_a_new_folder(tmp_path, capsys):
     random_policy(tmp_path / "first", CONFIG)
-    first = str(tmp_path / "first")
+    first, fewer = str(tmp_path / "first"), str(tmp_path / "fewer")
+    save_policy(tmp_path / "fewer", load_policy(first).params, of(CONFIG, 4), {})
     for arguments, named in (
         ([first, "--out", str(tmp_path / "out")], "at least two policies, got 1"),
         ([first, first, "--out", first], "exists already"),
+        (
+            [first, fewer, "--out", str(tmp_path / "out")],
+            f"{fewer}: parameters of 4 networks are wanted; member0 is mis",
+        ),
+        ([first, first, "--out", str(tmp_path / "first" / "params.safetensors" / "x")], "is not a writable folder"),
         ([first, str(tmp_path / "none"), "--out", str(tmp_path / "out")], "does not exist"),
         ([first] * 17 + ["--out", str(tmp_path / "out")], "17 networks together; allowed are 16"),
     ):

@@ -307,7 +307,7 @@ def test_hidden_state_cannot_leak():
 
 @pytest.mark.slow
 def test_an_evaluation_says_that_planning_was_used(tmp_path: Any):
-    settings = PlanningConfig(depth=0, variants=1)
+    settings = PlanningConfig(candidates=1, depth=0, variants=1)
     requests = [
         EvaluationConfig(policy="pretrained", plan=plan, planning=settings if plan else PlanningConfig(), episodes=2)
         for plan in (True, False)
@@ -318,7 +318,7 @@ def test_an_evaluation_says_that_planning_was_used(tmp_path: Any):
         documents.append(run_evaluation(request, player))
     planned, plain = documents
     assert plain["planning"] is None and planned["planning"]["settings"] == dataclasses.asdict(settings)
-    assert planned["planning"]["per_decision"]["pushes"] >= 12
+    assert planned["planning"]["per_decision"]["pushes"] > 3, "scripts add to the one that the network proposes"
     assert "pretrained with planning on 2 seen scenes" in format_evaluation(planned)
     found = compare(planned, plain)
     assert found.policies == ("pretrained with planning", "pretrained")

@@ -66,6 +66,22 @@ def test_evaluations_in_another_place_are_told_apart(tmp_path: Path) -> None:
     assert "--workspace shelf --task.place.half-width 0.25 --json" in lacking["clear on seen objects"]
 
 
+def test_rates_that_were_counted_or_seen_differently_are_told_apart(tmp_path: Path) -> None:
+    """Strict against lenient is never paired; the run that saw through the same sensor is paired first."""
+    run_dir = write_run(tmp_path / "first")
+    lenient = {"config": {"task": {"obstacles_may_leave": True}}}
+    d455 = {"camera": "pinhole", "sensor": {"name": "d455"}}
+    write_evaluation(run_dir / "evaluations" / "a.json", "first", [1, 1, 1, 1])
+    write_evaluation(run_dir / "evaluations" / "b.json", "first", [1, 1, 0, 0], **d455)
+    write_evaluation(run_dir / "evaluations" / "c.json", "clear", [0, 0, 0, 0], **lenient)
+    write_evaluation(run_dir / "evaluations" / "d.json", "pretrained", [1, 0, 0, 0], **d455)
+    run = read_run(run_dir)
+    cells = _texts(build_page(run, load_evaluations(run)))
+    rows = {cells[i]: cells[i + 1 : i + 10] for i, cell in enumerate(cells) if cell in ("clear", "pretrained")}
+    assert rows["clear"][1] == "table, obstacles may leave" and rows["clear"][-1] == "counted in another way"
+    assert rows["pretrained"][2] == "pinhole, sensor d455" and rows["pretrained"][-1].startswith("+25 points")
+
+
 def test_files_named_on_the_command_line_replace_those_of_the_folder(run_dir: Path, tmp_path: Path) -> None:
     write_evaluation(run_dir / "evaluations" / "a.json", "clear", [1, 0])
     named = write_evaluation(tmp_path / "b.json", "lookahead", [1, 1])
@@ -97,6 +113,14 @@ def test_commands_keep_the_task_of_the_run(tmp_path: Path) -> None:
     assert all("--object-set unseen --episodes 100 --object-dir 'my meshes'" in command for command in commands)
     assert ["--r-out 0.12" in command for command in commands] == [False, True, True, True, True]
     assert f"--policy '{tmp_path}/a run' " in commands[0]
+
+
+def test_a_run_is_called_by_its_name_from_wherever_it_is_named(run_dir: Path, monkeypatch) -> None:
+    monkeypatch.chdir(run_dir)
+    run = read_run(Path("."))
+    assert run.path == run_dir
+    write_evaluation(run_dir / "evaluations" / "a.json", "first", [1, 0])
+    assert not [what for what, _ in missing(run, load_evaluations(run)) if what.startswith("this run")]
 
 
 # --- curves ----------------------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """The command `report`, what a training session leaves behind, and the demo: films of policies in the fake world."""
 
+import contextlib
 import json
 import os
 import re
@@ -207,6 +208,7 @@ def test_the_demo_leaves_its_evaluations_and_a_report_with_films(
     shipped: list[str] = []
     monkeypatch.setattr(demo_module, "show_shipped", lambda _: shipped.append("shown"))
     monkeypatch.setattr(demo_module, "resume", lambda *_: shipped.append("trained") or 0)
+    monkeypatch.setattr(demo_module.RunFolder, "open", lambda *_: contextlib.nullcontext())
     # The shipped policy and the other scripts would only compile for longer.
     monkeypatch.setattr(demo_module, "_SCRIPTS", ("clear",))
     monkeypatch.setattr(demo_module, "_SHIPPED", "random")

@@ -73,10 +73,12 @@ def test_what_cannot_be_is_one_line(name, said, capsys):
     assert said in error and len(error.splitlines()) == 1
 
 
+@pytest.mark.parametrize("size", ["budget", "paper"])
 @pytest.mark.parametrize("name", NAMES)
-def test_a_dry_run_is_a_plan(name, capsys, tmp_path):
-    arguments = ["reproduce", name, "--dir", str(tmp_path / "new"), "--memory-gb", "0.01", "--dry-run", "True"]
-    assert main(arguments) == 0
+def test_a_dry_run_is_a_plan(name, size, capsys, tmp_path):
+    """Rows that go on from a policy have its network, or the dry run would refuse them."""
+    arguments = ["--dir", str(tmp_path / "new"), "--memory-gb", "0.01", "--dry-run", "True", "--size", size]
+    assert main(["reproduce", name, *arguments]) == 0
     assert re.match(r"\d+ settings, \d+ trials", capsys.readouterr().out)
     assert not (tmp_path / "new").exists()
 

@@ -30,6 +30,7 @@ def test_names_and_files(tmp_path: Path):
     assert get_sensor(str(path)) == dataclasses.replace(SENSORS["d455"], baseline=0.2, shadow=False)
     for text, said in (
         ("base: d999", "base = 'd999' does not exist"),
+        ("base: [d455]", r"base = \['d455'\] does not exist"),
         ("noise: 3", "unknown config key noise"),
         ("drop: 2.0", "drop = 2.0 is out of range"),
         ("cell: min", "cell = 'min' is unknown"),

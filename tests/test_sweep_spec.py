@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 
 from pregrasp_jax import yaml_file
+from pregrasp_jax.cli import sweep as sweep_command
 from pregrasp_jax.cli.main import main
 from pregrasp_jax.sweep import checks, launchers, parameters, state
+from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.spec import PROGRAM, Resources, Spec, read_spec, spec_from, to_plain
 from pregrasp_jax.sweep.state import TRIES, TrialState, next_jobs, read_states
 from pregrasp_jax.sweep.trials import flags, make_trial, setting_trials, train_command, trial_config
@@ -61,6 +63,8 @@ VARIANTS = {"parameters": None, "search": None, "stop": None, "final": None}
         ({"set": {**FULL["set"], "learner.discount": "high"}}, "learner.discount = 'high' has the wrong type"),
         ({"set": {**FULL["set"], "learner.discount": 1.5}}, "learner.discount = 1.5 is out of range"),
         ({"set": {**FULL["set"], "task.workspace": "shelves"}}, "task.workspace = 'shelves' does not exist"),
+        ({"set": {**FULL["set"], "assets.object_dir": "nowhere"}}, "assets.object_dir = 'nowhere' is no folder"),
+        ({"set": {**FULL["set"], "task.camera": "pinhole", "task.sensor": "d1"}}, "task.sensor = 'd1' does not exist"),
         ({"set": {**FULL["set"], "task.r_out": 0.2}}, "task.r_out stands in set and in parameters"),
         ({"set": {**FULL["set"], "seed": 2}}, "seed is decided by seeds"),
         ({"set": {**FULL["set"], "physics.threads": 2}}, "physics.threads is decided by resources.cores"),
@@ -82,6 +86,7 @@ VARIANTS = {"parameters": None, "search": None, "stop": None, "final": None}
         ({"stop": {"method": "halving", "rungs": [2000], "keep": 1.0}}, "stop.keep = 1.0 is out of range"),
         ({"stop": {"rungs": [2000]}}, "stop.rungs belong to stop.method halving"),
         ({"stop": {"metric": "train/loss"}}, "stop.metric = 'train/loss' is not of validation scenes"),
+        ({"stop": {"metric": "eval/succes_rate"}}, "stop.metric = 'eval/succes_rate' is not known; allowed: eval/succ"),
         ({"set": {"train.evaluate_every": 2000, "train.minutes": 0}, "parameters": {
             "train.env_steps": {"values": [6000, 8000]}, "task.r_out": {"values": [0.1]}},
           "search": {"method": "grid"}}, "train.env_steps may change when a run goes on"),
@@ -92,10 +97,17 @@ VARIANTS = {"parameters": None, "search": None, "stop": None, "final": None}
         ({"final": {"seeds": [10], "top": 0}}, "final.top = 0 is out of range"),
         ({"tests": {"far": {"camera": "pinhole"}}}, "tests.far: this version's evaluate knows no camera"),
         ({"tests": {"far": {"task.camera": "pin"}}}, "tests.far.task.camera = 'pin' is unknown"),
+        ({"tests": {"far": {"episodes.foo": 3}}}, "tests.far: this version's evaluate knows no episodes.foo"),
+        ({"tests": {"far": {"planning": {"depth": 1}}}}, "tests.far: this version's evaluate knows no planning;"),
+        ({"tests": {"far": {"episodes": 0}}}, "tests.far: episodes = 0 is out of range; allowed is 1 and more"),
+        ({"tests": {"far": {"planning.depth": 1}}}, "tests.far: planning.* is set, but plan = False"),
+        ({"tests": {"far": {"assets.object_dir": "nowhere"}}}, "tests.far.assets.object_dir = 'nowhere' is no folder"),
         ({"tests": {"far": {"policy": "pin"}}}, "tests.far.policy is decided by the trial"),
         ({**VARIANTS, "variants": {"shelf": {"task.shelf": 1}}}, "this version knows no setting task.shelf"),
         ({**VARIANTS, "variants": {"a": {"policy": "clear", "task.r_out": 1}}}, "variants.a names a policy"),
         ({**VARIANTS, "variants": {"a": {"init_from": "nowhere"}}}, "variants.a.init_from = 'nowhere' does not exist"),
+        ({**VARIANTS, "preset": "paper", "variants": {"a": {"init_from": "cpu-1"}}},
+         "variants.a.init_from = 'cpu-1' has network.architecture = compact, but is to go on with paper"),
         ({**VARIANTS, "variants": {"a": {"init_from": 3}}}, "variants.a.init_from = 3 has the wrong type"),
         ({**VARIANTS, "variants": {"a": {"task.r_out": 0.1}, "b": {"task.r_out": 0.1}}}, "variants.b is the same as "),
         ({**VARIANTS, "variants": {"a": {"policy": "clear"}, "b": {"policy": "straight"}},
@@ -129,6 +141,36 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(tmp_path, capsys):
     assert f"about {(12 / 2 + 2) * (8000 / 7.1 + 100) / 3600:.1f} hours" in said
     assert "--learner.learning-rate 0.0" in said and "--train.env-steps 8000" in said
     assert not (tmp_path / "s").exists()
+
+
+def test_a_dry_run_looks_at_the_folder_too(tmp_path, capsys):
+    (tmp_path / "spec.yaml").write_bytes(yaml_file.dump(FULL))
+    SweepFolder.create(tmp_path / "s", spec_from(FULL))
+    with pytest.raises(SystemExit):
+        main(["sweep", "start", str(tmp_path / "spec.yaml"), "--dir", str(tmp_path / "s"), "--dry-run", "True"])
+    assert "already holds a sweep; go on with `pregrasp-jax sweep resume" in capsys.readouterr().err
+
+
+def test_relative_paths_are_found_from_where_a_sweep_began(tmp_path, monkeypatch):
+    for name in ("begun", "meshes", "elsewhere"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "cell.yaml").write_text("base: d455\n")
+    keys = {"variants": {"a": {"init_from": "begun"}}, "tests": {"far": {"assets.object_dir": "meshes"}}}
+    given = {**FULL["set"], "task.camera": "pinhole", "task.sensor": "cell.yaml"}
+    monkeypatch.chdir(tmp_path)
+    folder = SweepFolder.create(tmp_path / "s", spec_from(changed(**VARIANTS, **keys, set=given)))
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    monkeypatch.setattr(sweep_command, "drive", lambda *_, **__: 7)
+    assert sweep_command.resume(folder.path) == 7
+    with pytest.raises(ValueError, match="init_from = 'begun' does not exist"):
+        checks.check(folder.spec())
+
+
+def test_an_event_that_lacks_something_is_one_line(tmp_path):
+    folder = SweepFolder.create(tmp_path / "s", spec_from(FULL))
+    folder.append({"event": "ended"})
+    with pytest.raises(ValueError, match=r"trials\.jsonl: event 2 is damaged: .*'ended'.*allowed is a copy of it"):
+        folder.states()
 
 
 def test_a_grid_is_whole_and_shuffled_and_draws_are_repeatable_typed_and_in_range():

@@ -9,6 +9,7 @@ import numpy as np
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.fit import Fit
 from pregrasp_jax.assets.meshes import LoadedDir, LoadingProgress, load_object_dir
+from pregrasp_jax.messages import command
 from pregrasp_jax.types import HullBank
 
 MIN_OBJECTS = 5
@@ -37,7 +38,7 @@ def load_bank_for(
         raise ValueError(
             f"{object_dir}: {len(bank.names)} usable '{object_set}' objects; allowed are at least {MIN_OBJECTS}. "
             f"{len(refusals)} were refused{first}; "
-            f"`pregrasp-jax assets {object_dir}` lists all"
+            f"`{command('assets', object_dir)}` lists all"
         )
     for refusal in refusals:
         warnings.warn(f"{object_dir}: {refusal.name} refused: {refusal.reason}", stacklevel=2)

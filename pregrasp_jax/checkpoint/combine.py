@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from pregrasp_jax import io
 from pregrasp_jax.checkpoint.policy import TrainedPolicy, load_policy, save_policy
 from pregrasp_jax.learning.members import join, split
 from pregrasp_jax.ranges import RANGES
@@ -12,6 +13,9 @@ from pregrasp_jax.settings import flatten, to_dict
 
 _FREE = ("network.members", "network.initial_bias")
 """Settings of the network that may differ."""
+
+_REWARDS = ("learner.discount", "train.try_grasps")
+"""Settings of the training on which depends what a value means."""
 
 
 def combine(policies: Sequence[Path | str], folder: Path) -> TrainedPolicy:
@@ -31,6 +35,7 @@ def combine(policies: Sequence[Path | str], folder: Path) -> TrainedPolicy:
         raise ValueError(f"combine needs at least two policies, got {len(policies)}")
     if folder.exists():
         raise ValueError(f"{folder} exists already; allowed is a new folder")
+    io.refuse_unwritable(folder)
     loaded = [load_policy(path) for path in policies]
     wanted = _meaning(policies[0], loaded[0])
     for path, policy in zip(policies, loaded, strict=True):
@@ -40,7 +45,7 @@ def combine(policies: Sequence[Path | str], folder: Path) -> TrainedPolicy:
                     f"{path} has {name} = {value}, but {policies[0]} {wanted[name]}: the mean of their values would "
                     f"mean nothing; allowed are policies of one network, task and discount"
                 )
-    networks = [params for policy in loaded for params in split(policy.params, policy.config.network.num_members)]
+    networks = [params for path, policy in zip(policies, loaded, strict=True) for params in _networks(path, policy)]
     most = int(RANGES["network.members"][1])
     if len(networks) > most:
         raise ValueError(f"the policies have {len(networks)} networks together; allowed are {most}")
@@ -50,6 +55,14 @@ def combine(policies: Sequence[Path | str], folder: Path) -> TrainedPolicy:
     return load_policy(folder)
 
 
+def _networks(path: Path | str, policy: TrainedPolicy) -> list[Any]:
+    """Return the parameters of every network of a policy."""
+    try:
+        return split(policy.params, policy.config.network.num_members)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
 def _meaning(path: Path | str, policy: TrainedPolicy) -> dict[str, Any]:
     """Return, by name, the settings that decide what a value means, and of what network it is."""
     if policy.config.train.method != "q_learning":
@@ -57,5 +70,5 @@ def _meaning(path: Path | str, policy: TrainedPolicy) -> dict[str, Any]:
     return {
         name: value
         for name, value in flatten(to_dict(policy.config)).items()
-        if name == "learner.discount" or (name.startswith(("network.", "task.")) and name not in _FREE)
+        if name in _REWARDS or (name.startswith(("network.", "task.")) and name not in _FREE)
     }

@@ -22,6 +22,7 @@ from pregrasp_jax.evaluation.player import make_player
 from pregrasp_jax.evaluation.statistics import compare as compare_evaluations
 from pregrasp_jax.evaluation.statistics import format_comparison
 from pregrasp_jax.evaluation_config import EvaluationConfig, TaskOverrides
+from pregrasp_jax.messages import command
 from pregrasp_jax.report.play import draw_decision, draw_scenes
 from pregrasp_jax.robot import get_robot
 from pregrasp_jax.scene.bank import SPLITS, SceneBank
@@ -55,12 +56,10 @@ def assets(
     Config(assets=AssetsConfig(variants=variants)).validate()
     prepare()
     names: Sequence[ObjectSet] = (object_set,) if object_set else _object_sets(object_dir)
-    for name in names:
-        loaded = _load_objects(object_dir, name)
+    sets = [_load_objects(object_dir, name) for name in names]  # all are read before the first is written
+    for name, loaded in zip(names, sets, strict=True):
         if variants:
-            loaded = LoadedDir(
-                variant_bank(loaded.bank, variants, seed=(SceneConfig().bank_seed, SPLITS.index("train")))
-            )
+            loaded = _made_beside(loaded, variants, object_dir, name)
         eligible, why_not = get_robot(TaskConfig().robot).eligibility(loaded.bank)
         file = png if len(names) == 1 else png.with_stem(f"{png.stem}-{name}")
         print(f"{name} ({object_dir or 'built in'})\n{format_table(loaded, why_not)}")
@@ -187,6 +186,17 @@ def _object_sets(object_dir: Path | None) -> list[ObjectSet]:
 
 def _load_objects(object_dir: Path | None, object_set: ObjectSet) -> LoadedDir:
     return LoadedDir(builtin_bank(object_set)) if object_dir is None else load_object_dir(object_dir, object_set)
+
+
+def _made_beside(loaded: LoadedDir, number: int, object_dir: Path | None, object_set: ObjectSet) -> LoadedDir:
+    """Return the objects that a training makes beside loaded ones, with what is to be said of these."""
+    if not loaded.bank.names:
+        raise ValueError(
+            f"{object_dir}: none of the {len(loaded.refusals)} meshes of '{object_set}' is usable, so none can be made "
+            f"beside them; `{command('assets', object_dir)}` says why"
+        )
+    made = variant_bank(loaded.bank, number, seed=(SceneConfig().bank_seed, SPLITS.index("train")))
+    return LoadedDir(made, loaded.refusals, loaded.notes, unused=loaded.unused)
 
 
 def _write_image(path: Path, image: np.ndarray) -> None:

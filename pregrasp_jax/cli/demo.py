@@ -38,9 +38,9 @@ def demo(*, run_dir: Path = Path("runs/demo"), minutes: float = 5.0, episodes: i
         raise ValueError(f"episodes = {episodes} is out of range; allowed is 1 and more")
     preset = PRESETS["demo"]
     config = dataclasses.replace(preset, train=dataclasses.replace(preset.train, minutes=minutes)).validate()
-    if not (run_dir / "config.yaml").exists():
-        with RunFolder.create(run_dir, config):
-            pass  # it is refused, or taken, before anything is played
+    begun = (run_dir / "config.yaml").exists()
+    with (RunFolder.open if begun else RunFolder.create)(run_dir, config):
+        pass  # it is refused, or taken, before anything is played
     show_shipped(run_dir)
     if code := resume(config, run_dir):
         raise SystemExit(code)

@@ -50,6 +50,7 @@ def start(
     """
     read = read_spec(spec)
     check(read, launcher=launcher, names=dry_run)
+    SweepFolder.refuse_used(dir)
     for line in describe(read, launcher=launcher, parallel=parallel):
         print(line, flush=True)
     if dry_run:
@@ -70,7 +71,7 @@ def resume(
     """
     opened = SweepFolder.open(folder)
     spec = opened.spec()
-    check(spec, launcher=launcher)
+    check(spec, launcher=launcher, here=opened.cwd)
     with opened.drive():  # what another driver was asked to do is not taken back
         opened.ask_to_stop(False)
         for failed in [s for s in opened.states() if retry and s.failed]:
@@ -167,18 +168,19 @@ def worker(
     return code
 
 
-def check(spec: Spec, *, launcher: LauncherName, names: bool = False) -> None:
+def check(spec: Spec, *, launcher: LauncherName, names: bool = False, here: Path = Path()) -> None:
     """Refuse what cannot work, before anything is written.
 
     Args:
         spec: of the sweep.
         launcher: its own needs are looked at, too.
         names: whether to check those that only the registries know, which takes JAX.
+        here: folder that relative paths refer to.
 
     Raises:
         ValueError: one line says what, where, and what is allowed.
     """
-    checks.check(spec)
+    checks.check(spec, here=here)
     if spec.search.method == "tpe":
         require_optuna()
     if launcher == "ray":
@@ -188,7 +190,7 @@ def check(spec: Spec, *, launcher: LauncherName, names: bool = False) -> None:
     if names and spec.program == PROGRAM:
         from pregrasp_jax.sweep.names import check_names
 
-        check_names(spec)
+        check_names(spec, here=here)
 
 
 def drive(folder: SweepFolder, spec: Spec, *, launcher: LauncherName, parallel: int | None) -> int:

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from pregrasp_jax.config import Config
+from pregrasp_jax.messages import command
 from pregrasp_jax.presets import PRESETS
 
 Session = Callable[[], int]
@@ -106,7 +107,7 @@ def _report(run_dir: Path, *, finished: bool) -> None:
 
         report_session(run_dir, finished=finished)
     except KeyboardInterrupt:
-        text = f"`pregrasp-jax report {run_dir}` writes the report"
+        text = f"`{command('report', run_dir)}` writes the report"
         print(f"interrupted while the report was written; the training is saved, {text}", file=sys.stderr)
 
 

@@ -1,6 +1,6 @@
 """cell.yaml: everything about a cell that the bundle cannot know. Unknown keys are errors; paths count from it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -139,9 +139,16 @@ def read_cell(path: Path) -> Cell:
     try:
         cell = from_dict(values if values is not None else {}, Cell)
         _refuse_ranges(cell)
-        return cell
+        return replace(cell, sim=_found_from(path.parent, cell.sim))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def _found_from(folder: Path, sim: SimSettings) -> SimSettings:
+    """Return what is simulated with its paths found from the folder of the file that names them."""
+    meshes = None if sim.object_dir is None else str(folder / sim.object_dir)
+    sensor = str(folder / sim.sensor) if sim.sensor.endswith((".yaml", ".yml")) else sim.sensor
+    return replace(sim, object_dir=meshes, sensor=sensor)
 
 
 def _refuse_ranges(cell: Cell) -> None:

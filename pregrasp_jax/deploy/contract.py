@@ -188,6 +188,9 @@ def _mean_of(members: int) -> str:
     return f", mean of {members} networks" if members > 1 else ""
 
 
+_NOT_MEASURED = "Nothing was measured when the policy was saved."
+
+
 def format_contract(contract: Contract) -> str:
     """Return the contract as text for people: Markdown that reads as plain text too."""
     grid, action, robot, camera = contract.grid, contract.action, contract.robot, contract.camera
@@ -238,7 +241,7 @@ def format_contract(contract: Contract) -> str:
         "",
         "## Evaluation",
         "",
-        *([f"* {key}: {value}" for key, value in contract.evaluation.items()] or ["None came with the policy."]),
+        *([f"* {key}: {value}" for key, value in contract.evaluation.items()] or [_NOT_MEASURED]),
         "",
         "## Not guaranteed",
         "",

@@ -14,7 +14,7 @@ from pregrasp_jax.checkpoint import TrainedPolicy, load_policy
 from pregrasp_jax.checkpoint.policy import PPG
 from pregrasp_jax.config import PUSHING, STYLES, Config, PlaceConfig, TaskConfig, with_absolute_paths
 from pregrasp_jax.evaluation import EpisodeCallback, Evaluator, evaluation_document, learned
-from pregrasp_jax.evaluation_config import EvaluationConfig, PlanningConfig, StrokesOverrides, TaskOverrides
+from pregrasp_jax.evaluation_config import EvaluationConfig, StrokesOverrides, TaskOverrides
 from pregrasp_jax.machine import announced_compilation
 from pregrasp_jax.planning.planner import Planner
 from pregrasp_jax.policies import scripts
@@ -66,7 +66,8 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     """
     prepare()
     trained = _load(request.policy)
-    _check_planning(request, trained)
+    _check_deciders(request, trained)
+    request.validate()
     _check_strokes(request)
     config = _environment_config(request, Config() if trained is None else trained.config)
     if trained is not None:
@@ -143,19 +144,14 @@ def _named(spec: str) -> tuple[str, str]:
     return (folder, style) if colon and style in STYLES else (spec, "")
 
 
-def _check_planning(request: EvaluationConfig, trained: TrainedPolicy | None) -> None:
-    """Refuse a search or a choice that has no network to ask, and settings of a search that is not wanted."""
+def _check_deciders(request: EvaluationConfig, trained: TrainedPolicy | None) -> None:
+    """Refuse a search or a choice that has no network to ask."""
     for key in ("plan", "reachable"):
         if getattr(request, key) and (trained is None or trained.config.train.method == "imitation"):
             kind = "is a script" if trained is None else "chooses strokes"
             raise ValueError(
                 f"{key} = True: policy {request.policy} {kind}; allowed is pretrained, or a run that learned pushes"
             )
-    if request.plan and request.reachable:
-        raise ValueError("reachable = True: plan = True takes no push that is out of reach; allowed is one of the two")
-    if not request.plan and request.planning != PlanningConfig():
-        raise ValueError("planning.* is set, but plan = False; allowed is plan = True with it")
-    request.planning.validate()
 
 
 def _check_strokes(request: EvaluationConfig) -> None:
@@ -196,10 +192,6 @@ def refuse_unknown_policy(spec: str, *, key: str) -> None:
 
 def _environment_config(request: EvaluationConfig, trained: Config) -> Config:
     """Return the configuration of the policy with everything replaced that the request decides."""
-    if request.num_envs < 0:
-        raise ValueError(f"num_envs = {request.num_envs} is out of range; allowed is 1 and more, or 0 to let it choose")
-    if request.episodes < 1:
-        raise ValueError(f"episodes = {request.episodes} is out of range; allowed is 1 and more")
     if trained.network.architecture == "compact" and (request.task.r_out or 0.0) > trained.task.r_out:
         raise ValueError(
             f"task.r_out = {request.task.r_out} is out of range; allowed for this policy, whose network values no "

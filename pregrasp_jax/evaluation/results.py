@@ -12,7 +12,15 @@ import numpy as np
 
 from pregrasp_jax import io
 from pregrasp_jax.config import Config
-from pregrasp_jax.evaluation.statistics import is_interval, is_number, policy_name, wilson_interval, workspace_of
+from pregrasp_jax.evaluation.statistics import (
+    counting_of,
+    is_interval,
+    is_number,
+    policy_name,
+    sensor_of,
+    wilson_interval,
+    workspace_of,
+)
 from pregrasp_jax.machine import versions
 from pregrasp_jax.sensors import get_sensor
 from pregrasp_jax.settings import to_dict
@@ -226,7 +234,9 @@ def _damaged_keys(document: dict[str, Any]) -> list[str]:
     found = document.get("obstructions", {})
     good["obstructions"] = isinstance(found, dict) and all(isinstance(counts, dict) for counts in found.values())
     good["rows"] = isinstance(rows, list) and len(rows) > 0 and all(map(_is_row, rows))
-    good["planning"] = document.get("planning") is None or isinstance(document["planning"], dict)
+    planning = document.get("planning") or {}
+    good["planning"] = isinstance(planning, dict) and isinstance(planning.get("settings", {}), dict)
+    good["sensor"] = isinstance(document.get("sensor", {}), dict)
     good["reachable"] = isinstance(document.get("reachable", False), bool)
     good["config"] = isinstance(config, dict) and isinstance(config.get("task", {}), dict)
     return [key for key, is_good in good.items() if not is_good]
@@ -258,9 +268,9 @@ def format_evaluation(document: dict[str, Any]) -> str:
         lines["held in any way"] = f"{document['lenient_rate']:.1%}"
     if document.get("overflows"):
         lines["contacts dropped"] = f"in {document['overflows']} episodes: the limits of the physics engine are too low"
-    sensor = document.get("sensor", {}).get("name", "clean")
-    camera = document["camera"] + (" camera" if sensor == "clean" else f" camera, sensor {sensor}")
-    settings = f"{workspace_of(document)}, {document['physics']} physics, {camera}, seed {document['seed']}"
+    where = workspace_of(document), counting_of(document)
+    how = f"{document['physics']} physics", f"{document['camera']} camera", sensor_of(document)
+    settings = ", ".join(filter(None, (*where, *how, f"seed {document['seed']}")))
     rows = [f"  {name:<18}{text}" for name, text in lines.items()]
     return "\n".join([f"{title} ({settings}, {document['wall_seconds']:.0f} s)", *rows])
 

@@ -30,6 +30,18 @@ def policy_name(document: Mapping[str, Any]) -> str:
     return document["policy"] + (", reachable" if document.get("reachable") else "")
 
 
+def sensor_of(document: Mapping[str, Any]) -> str:
+    """Return the sensor of an evaluation, if it gets anything wrong."""
+    sensor = document.get("sensor", {}).get("name", "clean")
+    return "" if sensor == "clean" else f"sensor {sensor}"
+
+
+def counting_of(document: Mapping[str, Any]) -> str:
+    """Return what was allowed of obstacles, if anything: rates that were counted differently are not compared."""
+    allowed = document.get("config", {}).get("task", {}).get("obstacles_may_leave", False)
+    return "obstacles may leave" if allowed else ""
+
+
 def decides_alone(document: Mapping[str, Any]) -> bool:
     """Return whether a policy's best push was executed, come what may."""
     return not document.get("planning") and not document.get("reachable")
@@ -243,6 +255,11 @@ def _differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
             yield f"{key}: {a[key]} | {b[key]}"
     if (chosen := [bool(document.get("reachable")) for document in (a, b)])[0] != chosen[1]:
         yield f"reachable: {chosen[0]} | {chosen[1]}"
+    sensors = [document.get("sensor", {}) for document in (a, b)]
+    if sensors[0].get("name") == sensors[1].get("name"):  # else the task's own line says so
+        for key in sorted(set(sensors[0]) & set(sensors[1])):
+            if sensors[0][key] != sensors[1][key]:
+                yield f"sensor.{key}: {sensors[0][key]} | {sensors[1][key]}"
     searches = [(document.get("planning") or {}).get("settings", {}) for document in (a, b)]
     for key in sorted(set(searches[0]) | set(searches[1])):
         if searches[0].get(key) != searches[1].get(key):

@@ -91,6 +91,8 @@ def _refuse(folder: Path, formats: Sequence[str], golden: int, force: bool) -> N
         raise ValueError(
             f"{folder} is not empty; allowed is a new folder, or --force True to replace a bundle that is there"
         )
+    if folder.resolve() == Path.cwd():
+        raise ValueError(f"{folder} is where the program runs, which cannot be replaced; allowed is another folder")
     io.refuse_unwritable(folder)
 
 

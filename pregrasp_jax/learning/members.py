@@ -16,8 +16,17 @@ def join(networks: Sequence[Params]) -> Params:
 
 
 def split(params: Params, members: int) -> list[Params]:
-    """Return the parameters of each of so many networks; undoes `join`."""
-    return [params] if members == 1 else [params[_name(index)] for index in range(members)]
+    """Return the parameters of each of so many networks; undoes `join`.
+
+    Raises:
+        ValueError: they are of fewer.
+    """
+    if members == 1:
+        return [params]
+    names = [_name(index) for index in range(members)]
+    if missing := [name for name in names if name not in params]:
+        raise ValueError(f"parameters of {members} networks are wanted; {missing[0]} is missing")
+    return [params[name] for name in names]
 
 
 def _name(index: int) -> str:

@@ -91,17 +91,21 @@ class Planner:
         memory = remembering.look(sight, memory, hidden=hidden, camera=self._camera)
         values = self._rollout.values(sight.obs, sight.target)
         proposed = spread_best(values, self._config.candidates)
-        if memory[sight.target] is None or len(proposed) < 2:  # nothing to search for, or among
+        if memory[sight.target] is None or not proposed:  # nothing to search for, or among
             return Planned(proposed[0] if proposed else 0, memory)
         script_key, variant_key = jax.random.split(key)
         bank, roots = self._rebuild(sight, memory, variant_key)
         scripted = self._rollout.propose(roots, script_key)[: max(_TRIED - len(proposed), 0)]
         candidates = list(dict.fromkeys([*proposed, *scripted]))
-        limit = self._config.budget_ms / 1e3 if self._config.budget_ms else math.inf
         left = self._max_pushes - sight.pushes
-        found = search(
-            self._rollout, bank, roots, candidates, self._config, self._promise, left=left, deadline=begin + limit
+        think = functools.partial(
+            search, self._rollout, bank, roots, candidates, self._config, self._promise, left=left
         )
+        if self._config.budget_ms and not self._seconds:
+            think(deadline=math.inf)  # compiles, which is no part of a decision
+            begin = time.perf_counter()
+        limit = self._config.budget_ms / 1e3 if self._config.budget_ms else math.inf
+        found = think(deadline=begin + limit)
         self._seconds.append(time.perf_counter() - begin)
         self._pushes.append(found.pushes)
         return Planned(found.action, memory)

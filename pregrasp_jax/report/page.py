@@ -3,13 +3,13 @@
 import datetime
 import importlib.resources
 import re
-import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from pregrasp_jax import io
 from pregrasp_jax.evaluation.statistics import is_number
+from pregrasp_jax.messages import command
 from pregrasp_jax.report import charts, results
 from pregrasp_jax.report.films import Film, film_strips
 from pregrasp_jax.report.markup import Markup, code, element, join
@@ -212,7 +212,7 @@ def _outdated(files: Sequence[str]) -> Iterator[Markup]:
 
 def _how_to_film(run: RunRecord) -> Iterator[Markup]:
     yield element("p", "No episodes of this policy were played. This command plays some and writes the page anew:")
-    yield element("pre", code(f"pregrasp-jax report {shlex.quote(str(run.path))}"))
+    yield element("pre", code(command("report", run.path)))
 
 
 def _episodes(films: Sequence[Film], note: str, policy: str | None = None, *, key: str = _FILM_KEY) -> Markup:

@@ -58,6 +58,8 @@ def read_run(path: Path) -> RunRecord:
     Raises:
         ValueError: no run folder, or one of its files is damaged; one line says which.
     """
+    if path.name != path.resolve().name:
+        path = path.resolve()  # `.` is no name to show, nor one that an evaluation is found by
     config_file = path / "config.yaml"
     if not config_file.is_file():
         raise ValueError(f"{path} is not a run folder (it has no config.yaml); wanted the --run-dir of a training")

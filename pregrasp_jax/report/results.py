@@ -1,13 +1,20 @@
 """The result table: a run beside the scripts, with intervals, and paired with it where scenes are the same."""
 
-import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from pregrasp_jax.config import PUSHING, STYLES, Config, TaskConfig
 from pregrasp_jax.evaluation import load_evaluation
-from pregrasp_jax.evaluation.statistics import compare, decides_alone, policy_name, workspace_of
+from pregrasp_jax.evaluation.statistics import (
+    compare,
+    counting_of,
+    decides_alone,
+    policy_name,
+    sensor_of,
+    workspace_of,
+)
+from pregrasp_jax.messages import command
 from pregrasp_jax.report.markup import Markup, element
 from pregrasp_jax.report.record import RunRecord
 from pregrasp_jax.report.svg import interval_mark
@@ -116,7 +123,7 @@ def _command(run: RunRecord, policy: str, object_set: str, episodes: int) -> str
     if policy in SCRIPTS["imitation"]:
         for key in ("robot", "primitive"):
             arguments += [f"--task.{key}", str(run.setting("task", key, getattr(TaskConfig(), key)))]
-    return shlex.join(["pregrasp-jax", "evaluate", *arguments, "--json", str(run.path / EVALUATIONS / f"{name}.json")])
+    return command("evaluate", *arguments, "--json", run.path / EVALUATIONS / f"{name}.json")
 
 
 def _place(run: RunRecord) -> Iterator[str]:
@@ -137,8 +144,8 @@ def _row(run: RunRecord, document: dict[str, Any], of_this_run: Sequence[dict[st
     name = element("strong", name.replace(document["policy"], f"this run ({document['policy']})")) if own else name
     cells = [
         document["object_set"],
-        workspace_of(document),
-        document["camera"],
+        _listed(workspace_of(document), counting_of(document)),
+        _seen_by(document),
         str(document["episodes"]),
         percent(document["success_rate"]),
         f"{percent(low)} to {percent(high)}",
@@ -151,14 +158,26 @@ def _row(run: RunRecord, document: dict[str, Any], of_this_run: Sequence[dict[st
     )
 
 
+def _listed(*names: str) -> str:
+    return ", ".join(filter(None, names))
+
+
+def _seen_by(document: dict[str, Any]) -> str:
+    return _listed(document["camera"], sensor_of(document))
+
+
 def _motions(document: dict[str, Any]) -> str:
     mean, std = document["mean_motions"], document["std_motions"]
     return "no success" if mean is None else f"{mean:.2f} ± {std:.2f}"
 
 
 def _paired(of_this_run: Sequence[dict[str, Any]], other: dict[str, Any]) -> str:
-    """Return the difference in points of the first evaluation of the run on the very same scenes."""
-    for document in of_this_run:
+    """Return the difference in points of the first evaluation of the run on the very same scenes, counted alike.
+
+    What was seen through the same camera and sensor comes first; scripts see nothing.
+    """
+    alike = [document for document in of_this_run if counting_of(document) == counting_of(other)]
+    for document in sorted(alike, key=lambda document: _seen_by(document) != _seen_by(other)):
         try:
             found = compare(document, other)
         except ValueError:
@@ -168,8 +187,9 @@ def _paired(of_this_run: Sequence[dict[str, Any]], other: dict[str, Any]) -> str
         return text.replace("-", "\N{MINUS SIGN}")
     if not of_this_run:
         return ""
-    here = workspace_of(other) in map(workspace_of, of_this_run)
-    return "not on the same scenes" if here else "in another place"
+    if workspace_of(other) not in map(workspace_of, of_this_run):
+        return "in another place"
+    return "not on the same scenes" if alike else "counted in another way"
 
 
 def _rank(run: RunRecord, document: dict[str, Any]) -> tuple[int, bool, str]:

@@ -1,13 +1,13 @@
 """Everything that can be known to be wrong before the first trial starts, one line each."""
 
 import itertools
-import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from pregrasp_jax.config import PUSHING
 from pregrasp_jax.evaluation_config import EvaluationConfig
+from pregrasp_jax.sensors import SENSORS, get_sensor
 from pregrasp_jax.settings import from_dict, to_dict
 from pregrasp_jax.spaces.workspace import WORKSPACES, get_workspace
 from pregrasp_jax.sweep import parameters
@@ -16,6 +16,9 @@ from pregrasp_jax.sweep.trials import trial_config
 
 GIVEN = {"seed": "seeds", "physics.threads": "resources.cores"}
 """Settings that other keys of a sweep decide."""
+
+METRICS = ("success_rate", "in_region_rate", "lenient_rate", "mean_return")
+"""What trainings measure on validation scenes of which more is better."""
 
 LIMITS = ("train.env_steps", "train.episodes", "train.minutes")
 
@@ -37,19 +40,23 @@ def settings_of(spec: Spec) -> list[Setting] | None:
     return [(setting, {}) for setting in _different(spec)]
 
 
-def check(spec: Spec) -> None:
+def check(spec: Spec, *, here: Path = Path()) -> None:
     """Refuse a sweep that cannot run as it is meant.
+
+    Args:
+        spec: of the sweep.
+        here: folder that relative paths refer to.
 
     Raises:
         ValueError: one line says what, where, and what is allowed.
     """
-    for problem in itertools.chain(_search(spec), _names(spec), _stop(spec), _resources(spec), _final(spec)):
+    for problem in itertools.chain(_search(spec), _names(spec, here), _stop(spec), _resources(spec), _final(spec)):
         raise ValueError(problem)
     for varied, about in settings_to_check(spec):
         if about.get("policy") is None:
-            _check_setting(spec, varied)
+            _check_setting(spec, varied, here)
     for name, options in spec.tests.items():
-        _check_test(spec, name, options)
+        _check_test(spec, name, options, here)
 
 
 def settings_to_check(spec: Spec) -> list[Setting]:
@@ -85,7 +92,7 @@ def _search(spec: Spec) -> Iterator[str]:
         yield f"search.trials = {search.trials}, but there are only {len(_different(spec))} settings to draw"
 
 
-def _names(spec: Spec) -> Iterator[str]:
+def _names(spec: Spec, here: Path) -> Iterator[str]:
     if doubled := sorted(set(spec.set) & set(spec.parameters)):
         yield f"{doubled[0]} stands in set and in parameters; allowed is one of them"
     varied = (variant.settings for variant in spec.variants.values())
@@ -101,7 +108,7 @@ def _names(spec: Spec) -> Iterator[str]:
         if variant.policy is not None and (variant.settings or variant.init_from):
             yield f"variants.{name} names a policy, which is not trained; allowed beside it is nothing"
         start = variant.init_from
-        if start is not None and start not in PUSHING and not Path(start).exists():
+        if start is not None and start not in PUSHING and not (here / start).exists():
             yield f"variants.{name}.init_from = {start!r} does not exist; allowed: pretrained, a run or a policy folder"
 
 
@@ -109,6 +116,8 @@ def _stop(spec: Spec) -> Iterator[str]:
     stop = spec.stop
     if not stop.metric.startswith("eval/"):
         yield f"stop.metric = {stop.metric!r} is not of validation scenes; allowed: eval/success_rate and others"
+    elif spec.program == PROGRAM and stop.metric.removeprefix("eval/") not in METRICS:
+        yield f"stop.metric = {stop.metric!r} is not known; allowed: eval/{', eval/'.join(METRICS)}"
     if stop.method == "none":
         if stop.rungs:
             yield "stop.rungs belong to stop.method halving"
@@ -147,10 +156,11 @@ def _final(spec: Spec) -> Iterator[str]:
             yield f"final.{name} = {getattr(final, name)} is out of range; allowed is 1 and more"
 
 
-def _check_setting(spec: Spec, varied: Mapping[str, Any]) -> None:
+def _check_setting(spec: Spec, varied: Mapping[str, Any], here: Path) -> None:
     config = trial_config(spec, {**spec.set, **varied})
     if spec.program == PROGRAM:  # another program may bring places of its own
         get_workspace(config.task.workspace)
+        _check_files(config.assets.object_dir, config.task.sensor, here, where="")
     if spec.stop.method == "none":
         return
     every, rungs = config.train.evaluate_every, spec.stop.rungs
@@ -165,8 +175,16 @@ def _check_setting(spec: Spec, varied: Mapping[str, Any]) -> None:
         )
 
 
-def _check_test(spec: Spec, name: str, options: Mapping[str, Any]) -> None:
-    """Refuse options that `evaluate` does not have, and places that are not there."""
+def _check_files(object_dir: str | None, sensor: str | None, here: Path, *, where: str) -> None:
+    """Refuse meshes and sensors that are not there; `where` precedes the names of the settings."""
+    if object_dir is not None and not (here / object_dir).is_dir():
+        raise ValueError(f"{where}assets.object_dir = {object_dir!r} is no folder; allowed is one with meshes")
+    if sensor is not None:
+        get_sensor(sensor if sensor in SENSORS else str(here / sensor))
+
+
+def _check_test(spec: Spec, name: str, options: Mapping[str, Any], here: Path) -> None:
+    """Refuse options that `evaluate` does not have or refuses, and places that are not there."""
     values = to_dict(EvaluationConfig(policy=""))
     for key, value in options.items():
         if key in ("policy", "physics.threads"):
@@ -174,16 +192,17 @@ def _check_test(spec: Spec, name: str, options: Mapping[str, Any]) -> None:
         *stages, last = key.split(".")
         section: Any = values
         for stage in stages:
-            section = section.get(stage, {}) if isinstance(section, dict) else {}
-        if last not in section:
-            raise ValueError(
-                f"tests.{name}: this version's evaluate knows no {key}; allowed here: {', '.join(section)}"
-            )
+            section = section.get(stage) if isinstance(section, dict) else None
+        if not isinstance(section, dict) or last not in section or isinstance(section[last], dict):
+            near = section if isinstance(section, dict) else values
+            raise ValueError(f"tests.{name}: this version's evaluate knows no {key}; allowed here: {', '.join(near)}")
         section[last] = value
     checked = from_dict(values, EvaluationConfig, f"tests.{name}.")
-    meshes = checked.assets.object_dir
-    if meshes is not None and not os.path.isdir(meshes):
-        raise ValueError(f"tests.{name}.assets.object_dir = {meshes!r} is no folder; allowed is one with meshes")
+    try:
+        checked.validate()
+    except ValueError as error:
+        raise ValueError(f"tests.{name}: {error}") from None
+    _check_files(checked.assets.object_dir, checked.task.sensor, here, where=f"tests.{name}.")
     if spec.program == PROGRAM and checked.task.workspace not in (None, *WORKSPACES):
         get_workspace(checked.task.workspace)
 

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from types import FrameType
 
+from pregrasp_jax.messages import command
 from pregrasp_jax.sweep import checks, estimate, state
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.launchers import Launcher
@@ -112,7 +113,7 @@ class Driver:
         if code == UNWRITTEN and self._lost[trial_id] > 1:
             raise ValueError(
                 f"nothing can be written to {self.folder.path}: the disk is full; nothing is lost, "
-                f"`pregrasp-jax sweep resume {self.folder.path}` goes on when there is room"
+                f"`{command('sweep', 'resume', self.folder.path)}` goes on when there is room"
             )
         if self._lost[trial_id] >= LOST_WORKERS:
             trial = next(s.trial for s in states if s.trial.id == trial_id)
@@ -148,7 +149,7 @@ class Driver:
             for trial_id, _ in self.launcher.ended():
                 self._submitted.discard(trial_id)
             time.sleep(POLL)
-        self.say(f"stopped; `pregrasp-jax sweep resume {self.folder.path}` goes on")
+        self.say(f"stopped; `{command('sweep', 'resume', self.folder.path)}` goes on")
         return 128 + (self._signal or signal.SIGTERM)
 
     def _tell(self, states: Sequence[TrialState], *, ended: bool) -> None:

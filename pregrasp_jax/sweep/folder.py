@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from pregrasp_jax import io, yaml_file
+from pregrasp_jax.messages import command
 from pregrasp_jax.sweep.spec import Spec, read_spec, spec_from, to_plain
 from pregrasp_jax.sweep.state import Record, TrialState, read_states
 from pregrasp_jax.sweep.trials import Trial, evaluation_files
@@ -39,6 +40,18 @@ class SweepFolder:
         """Read nothing yet."""
         self.path = path.absolute()
 
+    @staticmethod
+    def refuse_used(path: Path) -> None:
+        """Refuse a folder that no sweep can begin in.
+
+        Raises:
+            ValueError: it holds something.
+        """
+        if (path / SPEC).exists():
+            raise ValueError(f"{path} already holds a sweep; go on with `{command('sweep', 'resume', path)}`")
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise ValueError(f"{path} is not empty and holds no sweep; allowed is a new or empty folder")
+
     @classmethod
     def create(cls, path: Path, spec: Spec) -> "SweepFolder":
         """Begin a sweep.
@@ -46,10 +59,7 @@ class SweepFolder:
         Raises:
             ValueError: the folder holds something, or cannot be written.
         """
-        if (path / SPEC).exists():
-            raise ValueError(f"{path} already holds a sweep; go on with `pregrasp-jax sweep resume {path}`")
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise ValueError(f"{path} is not empty and holds no sweep; allowed is a new or empty folder")
+        cls.refuse_used(path)
         io.refuse_unwritable(path / SPEC)
         folder = cls(path)
         for name in ("runs", "logs", "locks"):
@@ -129,7 +139,10 @@ class SweepFolder:
 
     def states(self) -> list[TrialState]:
         """Return the trials in order and what became of them."""
-        return read_states(self.events())
+        try:
+            return read_states(self.events())
+        except ValueError as error:
+            raise ValueError(f"{self.path / TRIALS}: {error}; allowed is a copy of it that is whole") from None
 
     def is_running(self, trial: Trial) -> bool:
         """Return whether somebody works on a trial."""

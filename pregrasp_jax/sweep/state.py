@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from pregrasp_jax.messages import one_line
 from pregrasp_jax.sweep.spec import Spec
 from pregrasp_jax.sweep.trials import Trial
 
@@ -68,19 +69,31 @@ class Job(NamedTuple):
 
 
 def read_states(events: Sequence[Record]) -> list[TrialState]:
-    """Return the trials in the order of their numbers; what was planned twice is one trial."""
+    """Return the trials in the order of their numbers; what was planned twice is one trial.
+
+    Raises:
+        ValueError: an event does not have what belongs to it; one line names it.
+    """
     states: dict[str, TrialState] = {}
-    for event in events:
-        if event["event"] == "planned":
-            trial = Trial(**event["trial"])
-            states.setdefault(trial.id, TrialState(trial))
-        elif event["event"] == "started":
-            states[event["id"]].begun = True
-        elif event["event"] == "retry":
-            states[event["id"]].outcome, states[event["id"]].failures = "", 0
-        elif event["event"] == "ended":
-            _end(states[event["id"]], event)
+    for number, event in enumerate(events, start=1):
+        try:
+            _take(states, event)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            raise ValueError(f"event {number} is damaged: {one_line(event)[:80]}") from None
     return sorted(states.values(), key=lambda state: state.trial.number)
+
+
+def _take(states: dict[str, TrialState], event: Record) -> None:
+    """Change the states of trials, by id, as an event says."""
+    if event["event"] == "planned":
+        trial = Trial(**event["trial"])
+        states.setdefault(trial.id, TrialState(trial))
+    elif event["event"] == "started":
+        states[event["id"]].begun = True
+    elif event["event"] == "retry":
+        states[event["id"]].outcome, states[event["id"]].failures = "", 0
+    elif event["event"] == "ended":
+        _end(states[event["id"]], event)
 
 
 def _end(state: TrialState, event: Record) -> None:

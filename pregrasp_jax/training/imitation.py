@@ -31,6 +31,7 @@ from pregrasp_jax.learning.imitation import (
     update,
 )
 from pregrasp_jax.machine import announced_compilation
+from pregrasp_jax.messages import command
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.training.console import Console, format_time
 from pregrasp_jax.training.run_folder import RunFolder
@@ -93,7 +94,7 @@ def run(config: Config, env: Env, folder: RunFolder, console: Console, *, resume
     console.start()
     if not session.collect() or not session.learn():
         session.save()
-        return f"interrupted at step {session.counters.step}; continue with `pregrasp-jax train resume {folder.path}`"
+        return f"interrupted at step {session.counters.step}; continue with `{command('train', 'resume', folder.path)}`"
     session.save()
     losses = ", ".join(f"{name} {loss:.3g}" for name, loss in session.counters.best.items())
     return f"done: {session.counters.written} stable grasps learnt from; validation loss: {losses}"

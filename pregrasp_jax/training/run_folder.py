@@ -27,6 +27,7 @@ from pregrasp_jax.checkpoint.run_config import (
 from pregrasp_jax.checkpoint.state import exists
 from pregrasp_jax.config import Config
 from pregrasp_jax.machine import versions
+from pregrasp_jax.messages import command
 from pregrasp_jax.settings import difference, to_dict
 from pregrasp_jax.training.event_log import EventLog
 
@@ -208,8 +209,8 @@ def refuse_used(path: Path) -> None:
         raise ValueError(f"run folder {path} is a file; allowed is a new or empty folder")
     if (path / CONFIG).exists():
         raise ValueError(
-            f"run folder {path} already holds a run; continue it with `pregrasp-jax train resume {path}`, or choose "
-            "another --run-dir"
+            f"run folder {path} already holds a run; continue it with `{command('train', 'resume', path)}`, or "
+            "choose another --run-dir"
         )
     if path.exists() and any(entry.name != "run.lock" for entry in path.iterdir()):
         raise ValueError(f"run folder {path} is not empty and holds no run; allowed is a new or empty folder")

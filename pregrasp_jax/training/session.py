@@ -203,6 +203,16 @@ def make_evaluate(env: Env, config: Config) -> tuple[EvaluateFn, CompileFn]:
     return evaluate, compile_evaluation
 
 
+def _refuse_unused(config: Config) -> None:
+    """Refuse settings of Q-learning for a training that has no use for them."""
+    given, unset = flatten(to_dict(config)), flatten(to_dict(Config()))
+    for name, value in given.items():
+        if name.startswith(("network.", "learner.", "exploration.", "replay.")) and value != unset[name]:
+            raise ValueError(
+                f"{name} = {value} is not known to train.method = imitation; allowed is to leave it at {unset[name]}"
+            )
+
+
 def _imitate(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
     if params is not None:
         raise ValueError("--init-from is not known to train.method = imitation; allowed is to leave it out")
@@ -210,6 +220,8 @@ def _imitate(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
         raise ValueError("train.try_grasps = True is not known to train.method = imitation; allowed is False")
     if (tight := config.train.tight_targets) != 1:
         raise ValueError(f"train.tight_targets = {tight:g} is not known to train.method = imitation; allowed is 1")
+    if folder is None:
+        _refuse_unused(config)
     resumed = folder is not None
     env = own_protocol(_load(config, "train", console))
     folder = folder or _create(run_dir, config)

@@ -11,6 +11,7 @@ from pregrasp_jax.checkpoint import Restored, restore
 from pregrasp_jax.learning.q_function import Params
 from pregrasp_jax.learning.replay import forget
 from pregrasp_jax.machine import announced_compilation
+from pregrasp_jax.messages import command
 from pregrasp_jax.policies.exploration import linear_schedule
 from pregrasp_jax.training import learn, processes, schedules
 from pregrasp_jax.training.console import Console, format_time
@@ -82,7 +83,7 @@ class Trainer:
         self.recorder.dump(self.state)
         self.recorder.save(self.state)
         step, path = self.recorder.counters.env_steps, self.recorder.folder.path
-        return f"interrupted at step {step}; continue with `pregrasp-jax train resume {path}`"
+        return f"interrupted at step {step}; continue with `{command('train', 'resume', path)}`"
 
     def step(self, program: Program) -> None:
         """Push in every scene and learn from it: once, or as often as a compiled program does without the host."""
