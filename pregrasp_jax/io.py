@@ -15,6 +15,8 @@ import numpy as np
 PARTIAL = ".partial"
 """Ending of files that are being written."""
 
+_LONGEST_NAME = 255
+"""Bytes, of one file or folder."""
 
 CACHE = "PREGRASP_JAX_CACHE"
 """Environment variable that names the folder of rebuildable files."""
@@ -63,8 +65,12 @@ def refuse_unwritable(path: Path) -> None:
     """Refuse a file or folder that could not be written, before hours of work are spent on its content.
 
     Raises:
-        ValueError: its folder, or the nearest one that exists, does not allow writing.
+        ValueError: its folder, or the nearest one that exists, does not allow writing, or its name is too long.
     """
+    if (size := len(os.fsencode(path.name))) > _LONGEST_NAME:
+        raise ValueError(
+            f"{path.name[:32]}... cannot be written: its name has {size} bytes; allowed are {_LONGEST_NAME}"
+        )
     if not is_writable(path):
         folder = _existing_parent(path)
         raise ValueError(f"{path} cannot be written: {folder} is not a writable folder; allowed is one that is")
@@ -99,7 +105,7 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:
         OSError: the disk is full or does not allow it; its `filename` is set.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=PARTIAL, dir=path.parent)
+    handle, temporary = tempfile.mkstemp(prefix=hidden(path), suffix=PARTIAL, dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
             write(file)
@@ -112,6 +118,11 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:
         if isinstance(error, OSError) and error.errno and not error.filename:
             error.filename = str(path)  # a full disk does not say which file it was
         raise
+
+
+def hidden(path: Path) -> str:
+    """Return how the temporary name of a file or folder begins; as long as the name itself it could be too long."""
+    return f".{path.name[:32]}."
 
 
 def sweep(folder: Path) -> None:

@@ -57,11 +57,19 @@ COMMAND_LINES = [
     ),
     (
         "train ppg --run-dir {w}/new --train.tight-targets 3",
-        "train.tight_targets = 3 is not known to train.method = imitation; allowed is 1",
+        "train.tight_targets = 3.0 is not known to train.method = imitation; allowed is 1.0",
     ),
     (
         "train ppg --run-dir {w}/new --learner.optimizer muon",
-        "learner.optimizer = muon is not known to train.method = imitation; allowed is to leave it at adam",
+        "learner.optimizer = muon is not known to train.method = imitation; allowed is adam",
+    ),
+    (
+        "train ppg --run-dir {w}/new --train.minutes 3",
+        "train.minutes = 3.0 is not known to train.method = imitation; allowed is 0.0",
+    ),
+    (
+        "train ci --run-dir {w}/new --strokes.epochs 3",
+        "strokes.epochs = 3 is not known to train.method = q_learning; allowed is",
     ),
     (
         "pregrasp_jax dokter",

@@ -73,6 +73,23 @@ def test_a_bent_lens_is_straightened():
     assert max(np.abs(u - columns).max(), np.abs(v - rows).max()) < 1e-2
 
 
+@pytest.mark.parametrize("distortion", [(-0.056, 0.060, 0.0004, 0.0007, -0.016), (-0.3, 0.1), (0.25, 0.0, 0.001)])
+def test_a_bent_lens_sees_points_where_their_rays_are(distortion):
+    """The robot is drawn there; what the image does not show, where polynomials fold back, stays outside of it."""
+    bent = camera_at(distortion=(*distortion, *[0.0] * (5 - len(distortion))))
+    place = bent.world_from_optical[:3, 3]
+    rays = bent.rays(slice(0, 480), slice(0, 640)).astype(float)
+    pixels, depth = bent.project(place + 0.8 * np.moveaxis(rays, 0, -1))
+    columns, rows = np.meshgrid(np.arange(640), np.arange(480))
+    np.testing.assert_allclose(pixels, np.stack([columns, rows], axis=-1), atol=0.02)
+    np.testing.assert_allclose(depth, 0.8, atol=1e-5)
+    axis = bent.world_from_optical[:3, 2]
+    border = np.concatenate([rays[:, 0], rays[:, -1], rays[:, :, 0], rays[:, :, -1]], axis=1).T
+    for further in (1.02, 1.5, 3.0):
+        (u, v), _ = np.moveaxis(bent.project(place + axis + further * (border - axis))[0], -1, 0), None
+        assert not ((u > 0) & (u < 639) & (v > 0) & (v < 479)).any()
+
+
 class Tensor:
     """What torch gives, without torch."""
 

@@ -17,7 +17,7 @@ from bundles import ACTIONS, random_params, random_policy, small_bundle
 from pregrasp_jax.checkpoint import checksum, load_policy, state, write_config
 from pregrasp_jax.checkpoint.chunks import Ring
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.config import Config, NetworkConfig, TaskConfig
+from pregrasp_jax.config import Config, NetworkConfig, PlaceConfig, TaskConfig
 from pregrasp_jax.deploy.bundle import check_contract, read_bundle
 from pregrasp_jax.deploy.contract import CONTRACT_KEY, format_contract
 from pregrasp_jax.deploy.policy import load_values
@@ -27,6 +27,7 @@ from pregrasp_jax.export.onnx_policy import make_onnx
 from pregrasp_jax.export.stablehlo import policy_function
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.spaces.actions import ActionSpace, Choice
+from pregrasp_jax.spaces.workspace import get_workspace
 from pregrasp_jax.training.program import POLICY
 
 RNG = np.random.default_rng(0)
@@ -199,6 +200,21 @@ def test_a_folder_with_something_in_it_is_refused(tmp_path: Path, bundle: Path, 
     with pytest.raises(ValueError, match="allowed are some of safetensors, onnx, stablehlo"):
         export_policy(policy, tmp_path / "new", formats=["torch"])
     assert (tmp_path / "full" / "thesis.tex").read_text() == "years" and not (tmp_path / "new").exists()
+
+
+def test_walls_stand_where_the_policy_was_trained(tmp_path: Path):
+    """A robot keeps clear of the walls of the task in its dimensions, not in those that a place has by default."""
+    place = PlaceConfig(half_width=0.4, back=0.35, wall_height=0.2)
+    network = NetworkConfig(architecture="compact", width=1 / 32)
+    policy = random_policy(
+        tmp_path / "policy", Config(network=network, task=TaskConfig(workspace="shelf", place=place))
+    )
+    entry = export_policy(policy, tmp_path / "bundle", formats=["safetensors"], golden=2).place
+    wanted = get_workspace("shelf", {"half_width": 0.4, "back": 0.35, "wall_height": 0.2}).walls
+    assert [(wall["center_m"], wall["half_size_m"]) for wall in entry.walls] == [
+        (list(wall.center), list(wall.half_size)) for wall in wanted
+    ]
+    assert wanted != get_workspace("shelf").walls
 
 
 def refused(inputs: dict[str, np.ndarray]) -> str:

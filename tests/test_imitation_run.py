@@ -20,13 +20,27 @@ from pregrasp_jax.evaluation import load_evaluation
 from pregrasp_jax.evaluation.clearing import Cleared, summary
 from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.task.push_grasp import stroke_actions
-from pregrasp_jax.training import imitation
+from pregrasp_jax.training import imitation, session
 from pregrasp_jax.training.imitation import copy_positives, split
 from pregrasp_jax.training.run_folder import RunFolder
 from pregrasp_jax.training.stroke_collection import blank_positives
 
 ACTIONS = stroke_actions()
 STROKES = StrokesConfig(positives=8, width=1 / 32, epochs=2, batch_size=2, validation_share=0.25)
+
+
+class Silent:
+    def say(self, line):
+        pass
+
+    def start(self):
+        pass
+
+    def show(self, text, *, share):
+        pass
+
+
+SILENT: Any = Silent()
 
 
 def make_config(**changes):
@@ -59,6 +73,37 @@ def test_grasps_of_another_run_are_copied_as_far_as_there_is_room(collection):
         assert not into.height[expected:].any()
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"collection": "nowhere"}, "nowhere"),
+        ({"singulation": True, "positives": 4}, "0 of 4 stable grasps can be learnt from"),
+    ],
+)
+def test_a_collection_that_cannot_be_learnt_from_leaves_no_run(changes, said, collection, tmp_path, monkeypatch):
+    monkeypatch.setattr(session, "_load", lambda *_: pytest.fail("nothing is built for it"))
+    config = make_config(**{"collection": str(collection), **changes})
+    with pytest.raises(ValueError, match=said):
+        session.train(config, tmp_path / "new", console=SILENT)
+    assert not (tmp_path / "new").exists()
+
+
+def test_grasps_are_kept_though_too_few_can_be_learnt_from(tmp_path, monkeypatch):
+    """They are saved before they are divided, and another run can take them over."""
+    config = make_config(positives=3, singulation=True)
+
+    def collect(self) -> bool:
+        self.positives, self.counters.written = grasps(3, capacity=3), 3
+        return True
+
+    monkeypatch.setattr(imitation._Session, "collect", collect)
+    monkeypatch.setattr(imitation, "begin", lambda *_: jnp.zeros(1))
+    env: Any = types.SimpleNamespace(primitive=types.SimpleNamespace(actions=ACTIONS))
+    with RunFolder.create(tmp_path / "run", config) as folder, pytest.raises(ValueError, match="0 of 3 stable grasps"):
+        imitation.run(config, env, folder, SILENT, resumed=False, stop=lambda: False)
+    assert copy_positives(tmp_path / "run", blank_positives(3)) == 3
+
+
 def test_the_split_is_disjoint_and_keeps_to_the_singulation_condition():
     learnt, held_out = split(grasps(8), 8, make_config())
     assert sorted([*learnt, *held_out]) == list(range(8)) and len(held_out) == 2
@@ -78,24 +123,12 @@ def test_the_measures_of_ppgs_own_protocol():
     assert found["strokes"] == 5 and found["collided"] == 1 and found["sr_1_ci95"][0] > 0
 
 
-class Silent:
-    def say(self, line):
-        pass
-
-    def start(self):
-        pass
-
-    def show(self, text, *, share):
-        pass
-
-
 @pytest.mark.slow
 def test_a_run_that_was_stopped_ends_as_one_that_was_not(collection, tmp_path):
     config = make_config(collection=str(collection))
     env: Any = types.SimpleNamespace(primitive=types.SimpleNamespace(actions=ACTIONS))
-    console: Any = Silent()
 
-    def session(path, steps, *, resumed):
+    def part(path, steps, *, resumed):
         left = iter([False] * steps)
         folder = RunFolder.open(path, config) if resumed else RunFolder.create(path, config)
         with folder:
@@ -103,14 +136,14 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(collection, tmp_path):
                 config,
                 env,
                 folder,
-                console,
+                SILENT,
                 resumed=resumed,
                 stop=lambda: next(left, True),  # pyright: ignore
             )
 
-    assert "done: 6 stable grasps" in session(tmp_path / "whole", 100, resumed=False)
-    assert "interrupted at step 3" in session(tmp_path / "parts", 3, resumed=False)
-    assert "done" in session(tmp_path / "parts", 100, resumed=True)
+    assert "done: 6 stable grasps" in part(tmp_path / "whole", 100, resumed=False)
+    assert "interrupted at step 3" in part(tmp_path / "parts", 3, resumed=False)
+    assert "done" in part(tmp_path / "parts", 100, resumed=True)
     whole, parts = (load_policy(tmp_path / name) for name in ("whole", "parts"))
     for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(parts.params), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -23,6 +23,13 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["file"]
 
 
+def test_a_name_that_is_too_long_is_refused_before_the_work_and_one_that_fits_can_be_written(tmp_path):
+    io.write_bytes(tmp_path / ("n" * 255), b"whole")
+    io.refuse_unwritable(tmp_path / ("n" * 255))
+    with pytest.raises(ValueError, match="its name has 256 bytes; allowed are 255"):
+        io.refuse_unwritable(tmp_path / ("\N{LATIN SMALL LETTER U WITH DIAERESIS}" * 128))
+
+
 def test_readers_never_see_a_half_written_file(tmp_path):
     path = tmp_path / "deep" / "file"
 

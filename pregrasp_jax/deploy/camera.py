@@ -4,6 +4,7 @@ The frame here is the optical one (x right, y down, z forward); `frame: mujoco` 
 turned into it. Pixel centres are at integers.
 """
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,14 +60,24 @@ class PinholeCamera:
             )
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return pixels [..., 2] (column, row) and depth [...] m of world points [..., 3], without distortion."""
+        """Return pixels [..., 2] (column, row) and depth [...] m of world points [..., 3]; undoes `rays`."""
         turn, place = self.world_from_optical[:3, :3], self.world_from_optical[:3, 3]
         local = (points - place) @ turn
         depth = local[..., 2]
-        scale = 1 / np.maximum(depth, 1e-6)
-        col = self.matrix[0, 0] * local[..., 0] * scale + self.matrix[0, 2]
-        row = self.matrix[1, 1] * local[..., 1] * scale + self.matrix[1, 2]
+        x, y = np.moveaxis(local[..., :2] / np.maximum(depth, 1e-6)[..., None], -1, 0)
+        if any(self.distortion):
+            x, y = _distorted(x, y, self.distortion, within=self._widest)
+        col = self.matrix[0, 0] * x + self.matrix[0, 2]
+        row = self.matrix[1, 1] * y + self.matrix[1, 2]
         return np.stack([col, row], axis=-1), depth
+
+    @functools.cached_property
+    def _widest(self) -> float:
+        """Return how far from the axis, at depth 1 m, the ray through the farthest corner of the image is."""
+        k, (rows, columns) = self.matrix, self.shape
+        v, u = np.meshgrid([0.0, rows - 1.0], [0.0, columns - 1.0])
+        x, y = _undistorted((u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], self.distortion)
+        return float(np.hypot(x, y).max())
 
     def rays(self, rows: slice, columns: slice) -> np.ndarray:
         """Return directions [3, R, C] float32 through pixels of a part of the image, at depth 1 m, in the world."""
@@ -79,16 +90,32 @@ class PinholeCamera:
         return np.tensordot(self.world_from_optical[:3, :3], local, axes=1).astype(np.float32)
 
 
+def _bend(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return by what a lens multiplies and shifts (x, y), at depth 1 m: factor, shift of x, shift of y (Brown 1966)."""
+    k1, k2, p1, p2, k3 = distortion
+    r2 = x**2 + y**2
+    factor = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return factor, 2 * p1 * x * y + p2 * (r2 + 2 * x**2), p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+
+
+def _distorted(
+    x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...], *, within: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where a lens bends rays to.
+
+    Farther from the axis than `within`, where the image ends and the polynomials fold back, it bends as it does there.
+    """
+    inside = within / np.maximum(np.hypot(x, y), within)
+    factor, dx, dy = _bend(x * inside, y * inside, distortion)
+    return x * factor + dx, y * factor + dy
+
+
 def _undistorted(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return where rays go that a lens has bent to (x, y), by fixed-point iteration."""
-    k1, k2, p1, p2, k3 = distortion
     found_x, found_y = x, y
     for _ in range(_UNDISTORT_STEPS):
-        r2 = found_x**2 + found_y**2
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        dx = 2 * p1 * found_x * found_y + p2 * (r2 + 2 * found_x**2)
-        dy = p1 * (r2 + 2 * found_y**2) + 2 * p2 * found_x * found_y
-        found_x, found_y = (x - dx) / radial, (y - dy) / radial
+        factor, dx, dy = _bend(found_x, found_y, distortion)
+        found_x, found_y = (x - dx) / factor, (y - dy) / factor
     return found_x, found_y
 
 

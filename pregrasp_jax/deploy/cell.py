@@ -23,7 +23,8 @@ class CameraSettings:
     """The depth camera."""
 
     intrinsics: Rows | str | None = None
-    """K as three rows, or a ROS CameraInfo as YAML (k, d, width, height); None is the contract's camera."""
+    """K as three rows, or a ROS CameraInfo as YAML (k, d, width, height). `--arm sim` has the contract's camera
+    and needs neither."""
     width: int = 640
     height: int = 480
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -31,7 +32,7 @@ class CameraSettings:
     depth_scale: float | None = None
     """m per step; None is 1 for floats and 0.001 for integers."""
     extrinsics: Rows | str | None = None
-    """4 x 4, or the file of a calibration: where the camera is in `parent`; None is the contract's camera."""
+    """4 x 4, or the file of a calibration: where the camera is in `parent`."""
     parent: Literal["base", "base_link", "table"] = "base"
     """What the calibration is given in: the controller's base, ROS's, or the table frame."""
     frame: Literal["optical", "mujoco"] = "optical"

@@ -22,8 +22,8 @@ from pregrasp_jax.export.onnx_policy import make_onnx
 from pregrasp_jax.export.stablehlo import make_stablehlo
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.robot import get_robot, robot_file
-from pregrasp_jax.spaces.workspace import get_workspace
 from pregrasp_jax.task import registry
+from pregrasp_jax.task.place import place_of
 
 FORMATS = ("safetensors", "onnx", "stablehlo")
 """What a policy can be written as."""
@@ -53,7 +53,7 @@ def export_policy(
             f"policy {policy.origin} has learnt by {policy.config.train.method}; allowed are policies of Q-learning"
         )
     task = policy.config.task
-    robot, workspace = get_robot(task.robot), get_workspace(task.workspace)
+    robot, workspace = get_robot(task.robot), place_of(task)
     kind = registry.get_kind(task.primitive)
     primitive = kind.make_primitive(robot, workspace, task, max_distance=task.r_out)
     q_function = make_q_function(policy.config.network, task, primitive.actions)
@@ -104,7 +104,7 @@ def _write(folder: Path, contract: Contract, files: dict[str, bytes]) -> Contrac
     }
     contract = dataclasses.replace(contract, files=entries)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    staged = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=io.PARTIAL, dir=folder.parent))
+    staged = Path(tempfile.mkdtemp(prefix=io.hidden(folder), suffix=io.PARTIAL, dir=folder.parent))
     try:
         for name, data in files.items():
             io.write_bytes(staged / name, data)

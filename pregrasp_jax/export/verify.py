@@ -121,13 +121,13 @@ def _safetensors(bundle: Bundle, golden: Golden) -> np.ndarray:
     from pregrasp_jax.export.stablehlo import policy_function
     from pregrasp_jax.learning.q_function import make_q_function
     from pregrasp_jax.robot import get_robot
-    from pregrasp_jax.spaces.workspace import get_workspace
     from pregrasp_jax.task import registry
+    from pregrasp_jax.task.place import place_of
 
     policy = load_policy(bundle.folder / SAFETENSORS)
     task = policy.config.task
     make = registry.get_kind(task.primitive).make_primitive
-    actions = make(get_robot(task.robot), get_workspace(task.workspace), task, max_distance=task.r_out).actions
+    actions = make(get_robot(task.robot), place_of(task), task, max_distance=task.r_out).actions
     q_function = make_q_function(policy.config.network, task, actions)
     inputs = (jnp.asarray(golden[name]) for name in ("height_m", "labels", "p1_m"))
     return np.asarray(jax.jit(policy_function(q_function, policy.params))(*inputs))

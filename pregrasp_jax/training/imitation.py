@@ -92,10 +92,13 @@ def run(config: Config, env: Env, folder: RunFolder, console: Console, *, resume
     session = _Session(config, env, folder, console, stop)
     session.start(resumed=resumed and folder.has_checkpoint)
     console.start()
-    if not session.collect() or not session.learn():
+    collected = session.collect()
+    session.save()  # before it is learnt from, which may find too few grasps
+    learned = collected and session.learn()
+    if collected:
         session.save()
+    if not learned:
         return f"interrupted at step {session.counters.step}; continue with `{command('train', 'resume', folder.path)}`"
-    session.save()
     losses = ", ".join(f"{name} {loss:.3g}" for name, loss in session.counters.best.items())
     return f"done: {session.counters.written} stable grasps learnt from; validation loss: {losses}"
 
@@ -290,6 +293,16 @@ def split(positives: Positives, written: int, config: Config) -> tuple[np.ndarra
             f"strokes.validation_share = {strokes.validation_share}); allowed are 2 or more; raise strokes.positives"
         )
     return rows[held_out:], rows[:held_out]
+
+
+def refuse_collection(config: Config) -> None:
+    """Refuse grasps of another run that cannot be learnt from, before a run is made of them.
+
+    Raises:
+        ValueError: it is no run of this kind, has no intact checkpoint, or too few grasps.
+    """
+    positives = blank_positives(config.strokes.positives)
+    split(positives, copy_positives(Path(config.strokes.collection or ""), positives), config)
 
 
 def copy_positives(run: Path, into: Positives) -> int:

@@ -57,6 +57,7 @@ def train(config: Config, run_dir: Path, *, init_from: Path | None = None, conso
     prepare()
     if processes.is_first():
         refuse_used(run_dir)
+    _refuse_unused(config)
     console, config, params = console or _console(), with_absolute_paths(config), None
     if init_from is not None:
         policy = load_policy(init_from)
@@ -204,24 +205,19 @@ def make_evaluate(env: Env, config: Config) -> tuple[EvaluateFn, CompileFn]:
 
 
 def _refuse_unused(config: Config) -> None:
-    """Refuse settings of Q-learning for a training that has no use for them."""
+    """Refuse settings for which the method of a training has no use."""
+    method = config.train.method
     given, unset = flatten(to_dict(config)), flatten(to_dict(Config()))
     for name, value in given.items():
-        if name.startswith(("network.", "learner.", "exploration.", "replay.")) and value != unset[name]:
-            raise ValueError(
-                f"{name} = {value} is not known to train.method = imitation; allowed is to leave it at {unset[name]}"
-            )
+        if name.startswith(_UNUSED[method]) and name not in _USED and value != unset[name]:
+            raise ValueError(f"{name} = {value} is not known to train.method = {method}; allowed is {unset[name]}")
 
 
 def _imitate(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
     if params is not None:
         raise ValueError("--init-from is not known to train.method = imitation; allowed is to leave it out")
-    if config.train.try_grasps:
-        raise ValueError("train.try_grasps = True is not known to train.method = imitation; allowed is False")
-    if (tight := config.train.tight_targets) != 1:
-        raise ValueError(f"train.tight_targets = {tight:g} is not known to train.method = imitation; allowed is 1")
-    if folder is None:
-        _refuse_unused(config)
+    if folder is None and config.strokes.collection:
+        imitation.refuse_collection(config)
     resumed = folder is not None
     env = own_protocol(_load(config, "train", console))
     folder = folder or _create(run_dir, config)
@@ -237,6 +233,11 @@ def _imitate(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
         console.say(ending)
         return interrupt.exit_code or 0
 
+
+_UNUSED = {"q_learning": "strokes.", "imitation": ("network.", "replay.", "learner.", "exploration.", "train.")}
+"""What settings begin with that a method has no use for, but for those of `_USED`."""
+
+_USED = ("train.method", "train.num_envs", "train.checkpoint_minutes")
 
 METHODS = {"q_learning": _learn_q, "imitation": _imitate}
 """Sessions by the name that `train.method` knows them by."""
