@@ -106,7 +106,6 @@ RUNS = [
     ("train resume {w}/typo", "{w}/typo/config.yaml: unknown config key sead; allowed here: assets, exploration"),
     ("train resume {w}/range", "{w}/range/config.yaml: task.r_in = 3.0 is out of range; allowed is 0.005 to 0.5"),
     ("train resume {w}/run --seed 4", "a changed configuration (seed: 0 -> 4); allowed to change: train.minutes"),
-    ("pregrasp_jax demo --run-dir {w}/run", "a changed configuration (", "allowed to change: train.minutes"),
     (
         "train resume {w}/other",
         "run {w}/other began with another hull bank (of yesterday, now hulls); resume it with the",

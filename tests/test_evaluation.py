@@ -19,6 +19,7 @@ from pregrasp_jax.evaluation import Episode, EvaluationResult, Evaluator, evalua
 from pregrasp_jax.evaluation.statistics import compare, decides_alone
 from pregrasp_jax.policies import scripts
 from pregrasp_jax.policies.learned import make_learned
+from pregrasp_jax.sweep.checks import METRICS
 from pregrasp_jax.task.assembly import make_env
 from pregrasp_jax.task.primitive import Plan
 from pregrasp_jax.types import REASONS, EnvState, GraspResult, Observation
@@ -233,6 +234,10 @@ def test_files_and_comparisons_say_that_pushes_out_of_reach_were_passed_over(tmp
     (tmp_path / "e.json").write_text(json.dumps(reached | {"reachable": "yes"}))
     with pytest.raises(ValueError, match=r"damaged evaluation \(reachable\)"):
         results.load_evaluation(tmp_path / "e.json")
+
+
+def test_sweeps_rank_by_what_trainings_measure():
+    assert all(isinstance(RESULT.summary()[name], float) for name in METRICS)
 
 
 def test_files_and_comparisons_say_what_was_seen_and_how_it_was_counted(tmp_path: Path) -> None:

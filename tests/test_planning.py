@@ -23,11 +23,12 @@ from pregrasp_jax.evaluation.player import make_player, run_evaluation
 from pregrasp_jax.evaluation.statistics import compare
 from pregrasp_jax.evaluation_config import EvaluationConfig, PlanningConfig
 from pregrasp_jax.learning.q_function import make_q_function
+from pregrasp_jax.planning import planner
 from pregrasp_jax.planning import search as searching
 from pregrasp_jax.planning.memory import NOTHING, Sight
 from pregrasp_jax.planning.planner import Planned, Planner, spread_best
 from pregrasp_jax.planning.promise import promise_of
-from pregrasp_jax.planning.search import search
+from pregrasp_jax.planning.search import Choice, search
 from pregrasp_jax.robot.base import hand_pose_of
 from pregrasp_jax.task.assembly import make_env
 from pregrasp_jax.types import REASONS, EnvState, Observation, PhysicsObservation, SceneParams
@@ -276,6 +277,31 @@ def test_bad_settings_are_one_line(arguments: list[str], line: str, capsys: pyte
         main(["evaluate", *arguments])
     error = capsys.readouterr().err
     assert exit_.value.code == 2 and error.startswith("error: ") and error.count("\n") == 1 and line in error
+
+
+def test_scripts_join_one_proposal_and_compiling_takes_none_of_the_first_decisions_time(monkeypatch):
+    searched: list[tuple[list[int], float]] = []
+
+    def record(rollout, bank, roots, candidates, config, promise, *, left, deadline):
+        searched.append((candidates, deadline))
+        return Choice(candidates[-1], 3)
+
+    values = np.full((9, 9, 2), -np.inf)
+    values[4, 4, 1] = 0.5
+    scripted = SimpleNamespace(values=lambda *_: values, propose=lambda *_: [5, 6])
+    stub: Any = object.__new__(Planner)
+    vars(stub).update(
+        {"_config": PlanningConfig(candidates=1, budget_ms=50), "_promise": PROMISE, "_rollout": scripted},
+        **{"_max_pushes": 10, "_camera": None, "_seconds": [], "_pushes": [], "_rebuild": lambda *_: (None, None)},
+    )
+    monkeypatch.setattr(planner, "search", record)
+    monkeypatch.setattr(planner, "hidden_cells", lambda *_: None)
+    monkeypatch.setattr(planner.remembering, "look", lambda *_, **__: ["target"])
+    sight: Any = SimpleNamespace(obs=None, target=0, pushes=0)
+    assert [stub.decide(sight, ("",), jax.random.key(0)).action for _ in range(2)] == [6, 6]
+    best = (4 * 9 + 4) * 2 + 1
+    assert [candidates for candidates, _ in searched] == [[best, 5, 6]] * 3
+    assert [math.isinf(deadline) for _, deadline in searched] == [True, False, False]
 
 
 @pytest.mark.slow

@@ -227,6 +227,12 @@ def test_the_demo_leaves_its_evaluations_and_a_report_with_films(
     assert shipped == ["shown", "trained"]
 
 
+def test_the_demo_refuses_another_run_before_anything_is_played(run_dir: Path, monkeypatch) -> None:
+    monkeypatch.setattr(demo_module, "show_shipped", lambda _: pytest.fail("played"))
+    with pytest.raises(ValueError, match="a changed configuration"):
+        demo_module.demo(run_dir=run_dir)
+
+
 def test_the_demo_begins_with_the_shipped_policy_at_work(drawn: list[Any], tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(demo_module, "_SHIPPED", "straight")
     monkeypatch.setattr(demo_module, "resume", lambda *_: 3)

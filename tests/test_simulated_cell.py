@@ -33,11 +33,15 @@ def test_objects_and_scenes_are_those_of_an_evaluation(scene, tmp_path: Path, mo
         physics=PhysicsConfig(engine="mjx"),
     )
     policy = random_policy(tmp_path / "policy", trained)
-    export_policy(policy, tmp_path / "bundle", formats=["safetensors"], golden=2)
+    export_policy(policy, tmp_path / "bundle", formats=["onnx"], golden=2)
     cell = dataclasses.replace(Cell(), sim=SimSettings(scene=scene, object_set="unseen", sensor="d455"))
     monkeypatch.setattr(simulated_cell, "make_env", ask)
     with pytest.raises(Asked) as asked:
         simulated_cell.make_programs(read_bundle(tmp_path / "bundle"), cell)
+    (tmp_path / "used").mkdir()
+    (tmp_path / "used" / "decision-000.npz").touch()
+    with pytest.raises(ValueError, match="decisions of an earlier trial"):  # before anything is built
+        simulated_cell.make_simulated_station(read_bundle(tmp_path / "bundle"), cell, log=tmp_path / "used")
     found, split = asked.value.args
     request = EvaluationConfig(
         policy="x",

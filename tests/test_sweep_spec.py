@@ -145,10 +145,11 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(tmp_path, capsys):
 
 def test_a_dry_run_looks_at_the_folder_too(tmp_path, capsys):
     (tmp_path / "spec.yaml").write_bytes(yaml_file.dump(FULL))
-    SweepFolder.create(tmp_path / "s", spec_from(FULL))
+    used = tmp_path / "my sweep"
+    SweepFolder.create(used, spec_from(FULL))
     with pytest.raises(SystemExit):
-        main(["sweep", "start", str(tmp_path / "spec.yaml"), "--dir", str(tmp_path / "s"), "--dry-run", "True"])
-    assert "already holds a sweep; go on with `pregrasp-jax sweep resume" in capsys.readouterr().err
+        main(["sweep", "start", str(tmp_path / "spec.yaml"), "--dir", str(used), "--dry-run", "True"])
+    assert f"already holds a sweep; go on with `pregrasp-jax sweep resume '{used}'`" in capsys.readouterr().err
 
 
 def test_relative_paths_are_found_from_where_a_sweep_began(tmp_path, monkeypatch):
