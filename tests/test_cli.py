@@ -326,6 +326,20 @@ def test_assets_lists_and_draws_a_folder(run: Any, tmp_path: Path, monkeypatch: 
     assert code == 2 and "assets.variants = -1 is out of range; allowed is 0 to 10000" in err
 
 
+def test_no_sheet_is_written_before_both_sets_are_read(
+    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PREGRASP_JAX_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(meshes, "WorkerPool", InlineExecutor)
+    for name in ("seen", "unseen"):
+        (tmp_path / "meshes" / name).mkdir(parents=True)
+        trimesh.creation.box((0.06, 0.06, 0.15)).export(tmp_path / "meshes" / name / "carton.stl")
+    (tmp_path / "meshes" / "unseen" / "objects.yaml").write_text("carton.stl: {colour: red}")
+    code, _, err = run("assets", str(tmp_path / "meshes"), "--png", str(tmp_path / "sheet.png"))
+    assert code == 2 and "unknown setting 'colour'" in err
+    assert not list(tmp_path.glob("*.png"))
+
+
 def test_describe_scenes_counts() -> None:
     object_ids = np.full((3, 8), -1)
     object_ids[0, :2], object_ids[1, :2], object_ids[2, :3] = (0, 1), (1, 2), (2, 0, 1)
