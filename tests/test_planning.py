@@ -123,11 +123,12 @@ class World:
         reason = np.array([REASONS.index(name) for name, _ in told])
         self.pushes, self.calls = self.pushes + int(execute.sum()), self.calls + 1
         results = SimpleNamespace(reason=reason, terminated=reason != 0)
-        values = np.array([value for _, value in told])
-        actions = np.tile([1, 2], (len(after), 1))
-        return SimpleNamespace(
-            states=after, results=results, safety=np.ones(len(after)), values=values, actions=actions
-        )
+        return SimpleNamespace(states=after, results=results, safety=np.ones(len(after)))
+
+    def propose(self, states: list[np.ndarray]) -> Any:
+        told = [self.rules.get(int(state), ("running", 0.5)) for state in states]
+        assert told and {reason for reason, _ in told} == {"running"}, "nothing is asked where an episode has ended"
+        return SimpleNamespace(values=np.array([value for _, value in told]), actions=np.tile([1, 2], (len(states), 1)))
 
     def succeeded(self, reason: np.ndarray) -> np.ndarray:
         return reason == REASONS.index("target_in_region")
@@ -288,7 +289,7 @@ def test_scripts_join_one_proposal_and_compiling_takes_none_of_the_first_decisio
 
     values = np.full((9, 9, 2), -np.inf)
     values[4, 4, 1] = 0.5
-    scripted = SimpleNamespace(values=lambda *_: values, propose=lambda *_: [5, 6])
+    scripted = SimpleNamespace(values=lambda *_: values, script=lambda *_: [5, 6])
     stub: Any = object.__new__(Planner)
     vars(stub).update(
         {"_config": PlanningConfig(candidates=1, budget_ms=50), "_promise": PROMISE, "_rollout": scripted},

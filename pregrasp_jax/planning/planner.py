@@ -23,7 +23,7 @@ from pregrasp_jax.task.env import Env
 from pregrasp_jax.types import MAX_OBJECTS, EnvState, HullBank
 
 BATCH = 6
-"""Pushes simulated at a time: what pads a batch is drawn and valued for nothing."""
+"""Pushes simulated at a time: what pads a batch is drawn for nothing."""
 
 _TRIED = 12
 """Candidates with those of scripts."""
@@ -95,7 +95,7 @@ class Planner:
             return Planned(proposed[0] if proposed else 0, memory)
         script_key, variant_key = jax.random.split(key)
         bank, roots = self._rebuild(sight, memory, variant_key)
-        scripted = self._rollout.propose(roots, script_key)[: max(_TRIED - len(proposed), 0)]
+        scripted = self._rollout.script(roots, script_key)[: max(_TRIED - len(proposed), 0)]
         candidates = list(dict.fromkeys([*proposed, *scripted]))
         left = self._max_pushes - sight.pushes
         think = functools.partial(

@@ -1,7 +1,7 @@
 """Pushes of rebuilt scenes, a batch of one size at a time: simulate, judge by the task's rules, ask the network."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -25,6 +25,9 @@ NUM_SCRIPTED = 8
 NUM_NEXT, _APART = 3, 0.02
 """Pushes that the network proposes after a simulated one, and how far apart they are, m."""
 
+_ASKED = 3
+"""Scenes that the network values at a time: half of the pushes end an episode, and what pads is valued for nothing."""
+
 _MOVED, _EDGE = 0.005, 0.02
 """m; an object that moved more than this and ended nearer to an edge than that may have fallen in truth: where objects
 end is known to 1 to 5 cm only after a long way."""
@@ -37,15 +40,23 @@ class Pushed(NamedTuple):
         states: where they led.
         results: what the rules say.
         safety: [B] how likely nothing else has left the workspace than what has left here.
-        values: [B] of the best push that the network knows next.
-        actions: [B, NUM_NEXT] int32, that push and others that it knows.
     """
 
     states: EnvState
     results: StepResult
     safety: jax.Array
-    values: jax.Array
-    actions: jax.Array
+
+
+class Proposed(NamedTuple):
+    """What the network says of N scenes.
+
+    Attributes:
+        values: [N] of its best push.
+        actions: [N, NUM_NEXT] int32, that push and others.
+    """
+
+    values: np.ndarray
+    actions: np.ndarray
 
 
 class Rollout:
@@ -66,7 +77,7 @@ class Rollout:
         self._engine = engine_of(simulations, env.robot)
         self._num_velocities = simulations.model.mj_model.nv
         self._start = jax.jit(jax.vmap(self._start_one, (None, 0, 0, 0, None, None)))
-        self._propose, self._values = jax.jit(self._propose_one), jax.jit(self._values_one)
+        self._script, self._values, self._ask = map(jax.jit, (self._script_one, self._values_one, self._ask_some))
         self._push = make_stages(self._engine, self._before_push, self._after_push)
         self._grasp = make_stages(self._engine, self._before_grasp, self._after_grasp)
         self._compiled: dict[str, Callable[..., Any]] = {}
@@ -96,9 +107,19 @@ class Rollout:
         """Return what the network says of every push after a real picture, [H, W, K]; -inf where it is not allowed."""
         return np.asarray(self._values(self._params, obs, np.int32(target)))
 
-    def propose(self, roots: EnvState, key: jax.Array) -> list[int]:
+    def script(self, roots: EnvState, key: jax.Array) -> list[int]:
         """Return the pushes of scripts in the first of rebuilt scenes [V]; `NUM_SCRIPTED` of them."""
-        return np.asarray(self._propose(jax.tree.map(lambda leaf: leaf[0], roots), key)).tolist()
+        return np.asarray(self._script(jax.tree.map(lambda leaf: leaf[0], roots), key)).tolist()
+
+    def propose(self, states: Sequence[EnvState]) -> Proposed:
+        """Return what the network would push next in N >= 1 rebuilt scenes, as host arrays."""
+        found = []
+        for start in range(0, len(states), _ASKED):
+            some = states[start : start + _ASKED]
+            padded = [*some, *[some[-1]] * (_ASKED - len(some))]
+            seen = jax.tree.map(lambda *leaves: np.stack(leaves), *((s.obs, s.scene.target) for s in padded))
+            found.append(self._ask(self._params, *seen))
+        return Proposed(*(np.concatenate(parts)[: len(states)] for parts in zip(*found, strict=True)))
 
     def succeeded(self, reason: jax.Array) -> np.ndarray:
         """Return which reasons [B] count as success, [B] bool."""
@@ -106,7 +127,7 @@ class Rollout:
 
     def push(self, bank: HullBank, states: EnvState, actions: np.ndarray, execute: np.ndarray) -> Pushed:
         """Push in B states; where not to be executed [B], nothing is simulated."""
-        return self._run("push", self._push, bank, self._params, states, actions, execute)
+        return self._run("push", self._push, bank, states, actions, execute)
 
     def grasp(self, bank: HullBank, states: EnvState, execute: np.ndarray) -> np.ndarray:
         """Return which grasps hold, [B] bool; those not to be executed [B] do not."""
@@ -146,7 +167,7 @@ class Rollout:
         )
         return self._rebuilt(bank).look(state, hand)
 
-    def _propose_one(self, state: EnvState, key: jax.Array) -> jax.Array:
+    def _script_one(self, state: EnvState, key: jax.Array) -> jax.Array:
         env = self._env
         half = (NUM_SCRIPTED - 2) // 2
         keys = jax.random.split(key, 2 * half)
@@ -158,22 +179,25 @@ class Rollout:
     def _values_one(self, params: Any, obs: Observation, target: jax.Array) -> jax.Array:
         return jnp.where(self._env.action_mask(obs.hand), self._q.values(params, obs, target), -jnp.inf)
 
+    def _ask_some(self, params: Any, obs: Observation, targets: jax.Array) -> tuple[jax.Array, jax.Array]:
+        inputs = jax.vmap(self._q.input_fn)(obs, targets)
+        q = jnp.where(jax.vmap(self._env.action_mask)(obs.hand), self._q.apply(params, inputs), -jnp.inf)
+        return q.max(axis=(1, 2, 3)), jax.vmap(self._next)(q)
+
     def _before_push(
-        self, bank: HullBank, params: Any, states: EnvState, actions: jax.Array, execute: jax.Array
+        self, bank: HullBank, states: EnvState, actions: jax.Array, execute: jax.Array
     ) -> tuple[Any, Plan, Any]:
         plan = jax.vmap(lambda s, a, go: self._env.plan(s, a).unless(~go, "no_ik"))(states, actions, execute)
-        return states.physics, plan, (bank, params, states)
+        return states.physics, plan, (bank, states)
 
     def _after_push(self, kept: Any, plan: Plan, physics: Any) -> Pushed:
-        bank, params, states = kept
+        bank, states = kept
         env = self._rebuilt(bank)
         before = states.centroids
         states, results = jax.vmap(env.conclude)(states, plan, physics)
         moved = jnp.linalg.norm(states.centroids - before, axis=-1) > _MOVED
         safety = jax.vmap(self._safety)(states.centroids, moved & (states.scene.object_ids >= 0), states.scene.target)
-        inputs = jax.vmap(self._q.input_fn)(states.obs, states.scene.target)
-        q = jnp.where(jax.vmap(env.action_mask)(states.hand), self._q.apply(params, inputs), -jnp.inf)
-        return Pushed(states, results, safety, q.max(axis=(1, 2, 3)), jax.vmap(self._next)(q))
+        return Pushed(states, results, safety)
 
     def _next(self, q: jax.Array) -> jax.Array:
         actions = self._env.primitive.actions

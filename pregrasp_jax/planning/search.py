@@ -57,6 +57,7 @@ class Node:
         depth: pushes so far.
         safety: how likely nothing else has left the workspace until now than what has left.
         promise: how likely the episode ends well, discounted by the pushes that takes, if no continuation is known.
+        ended: whether the episode has.
         ungrasped: whether the target is enclosed and its grasp has yet to be tried.
         children: where the first of the proposals have led.
     """
@@ -66,6 +67,7 @@ class Node:
     depth: int = 0
     safety: float = 1.0
     promise: float = 0.0
+    ended: bool = False
     ungrasped: bool = False
     children: "list[Node]" = field(default_factory=list)
 
@@ -119,8 +121,10 @@ def search(
         due = [n for c in best for n in _due(trees[c], candidates[c], roots, 1 + number, config, left)]
         batches = _batches(due, rollout.batch)
         # All are under way before the first is looked at: its pictures are drawn while the next is pushed.
-        for nodes, pushed in zip(batches, [_push(rollout, bank, nodes) for nodes in batches], strict=True):
-            _grow(rollout, nodes, pushed, promise, left)
+        pushed = [_push(rollout, bank, nodes) for nodes in batches]
+        for nodes, ends in zip(batches, pushed, strict=True):
+            _grow(rollout, nodes, ends)
+        _look_ahead(rollout, [node.children[-1] for node in due], promise, left)
         if len(best) <= GRASPED:
             _grasp_leader(rollout, bank, [trees[c] for c in best])
         last = time.perf_counter() - begin
@@ -170,23 +174,36 @@ def _push(rollout: Rollout, bank: HullBank, nodes: list[Node]) -> Pushed:
     return rollout.push(bank, states, actions, real)
 
 
-def _grow(rollout: Rollout, nodes: list[Node], pushed: Pushed, promise: Promise, left: int) -> None:
-    """Append to every node where its push has led; `promise` and `left` are as in `search`."""
-    ends, proposals, terminated = jax.device_get((pushed.states, pushed.actions, pushed.results.terminated))
-    enclosed = rollout.succeeded(pushed.results.reason)
-    chances = DISCOUNT * promise(np.asarray(pushed.values))
+def _grow(rollout: Rollout, nodes: list[Node], pushed: Pushed) -> None:
+    """Append to every node where its push has led."""
+    ends, reasons, terminated, safety = jax.device_get(
+        (pushed.states, pushed.results.reason, pushed.results.terminated, pushed.safety)
+    )
+    enclosed = rollout.succeeded(reasons)
     for i, node in enumerate(nodes):
-        in_time = 1 - (1 - ENDS) ** (left - node.depth - 1)
-        safety = node.safety * float(pushed.safety[i])
+        so_safe = node.safety * float(safety[i])
         child = Node(
             state=jax.tree.map(lambda leaf, i=i: leaf[i], ends),
-            proposals=[] if terminated[i] else proposals[i].tolist(),
+            proposals=[],
             depth=node.depth + 1,
-            safety=safety,
-            promise=float(enclosed[i] if terminated[i] else in_time * chances[i]) * safety * DISCOUNT**node.depth,
+            safety=so_safe,
+            promise=float(enclosed[i]) * so_safe * DISCOUNT**node.depth,
+            ended=bool(terminated[i]),
             ungrasped=bool(enclosed[i]),
         )
         node.children.append(child)
+
+
+def _look_ahead(rollout: Rollout, nodes: list[Node], promise: Promise, left: int) -> None:
+    """Ask the network what follows wherever an episode has not ended; `promise` and `left` are as in `search`."""
+    nodes = [node for node in nodes if not node.ended]
+    if not nodes:
+        return
+    proposed = rollout.propose([node.state for node in nodes])
+    for node, chance, actions in zip(nodes, promise(proposed.values), proposed.actions.tolist(), strict=True):
+        in_time = 1 - (1 - ENDS) ** (left - node.depth)
+        node.proposals = actions
+        node.promise = in_time * float(chance) * node.safety * DISCOUNT**node.depth
 
 
 def _grasp_leader(rollout: Rollout, bank: HullBank, best: list[list[Node]]) -> None:
