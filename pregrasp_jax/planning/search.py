@@ -57,7 +57,6 @@ class Node:
         depth: pushes so far.
         safety: how likely nothing else has left the workspace until now than what has left.
         promise: how likely the episode ends well, discounted by the pushes that takes, if no continuation is known.
-        ended: whether the episode has.
         ungrasped: whether the target is enclosed and its grasp has yet to be tried.
         children: where the first of the proposals have led.
     """
@@ -67,7 +66,6 @@ class Node:
     depth: int = 0
     safety: float = 1.0
     promise: float = 0.0
-    ended: bool = False
     ungrasped: bool = False
     children: "list[Node]" = field(default_factory=list)
 
@@ -122,9 +120,9 @@ def search(
         batches = _batches(due, rollout.batch)
         # All are under way before the first is looked at: its pictures are drawn while the next is pushed.
         pushed = [_push(rollout, bank, nodes) for nodes in batches]
-        for nodes, ends in zip(batches, pushed, strict=True):
-            _grow(rollout, nodes, ends)
-        _look_ahead(rollout, [node.children[-1] for node in due], promise, left)
+        going_on = [child for nodes, ends in zip(batches, pushed, strict=True) for child in _grow(rollout, nodes, ends)]
+        if going_on:
+            _look_ahead(rollout, going_on, promise, left)
         if len(best) <= GRASPED:
             _grasp_leader(rollout, bank, [trees[c] for c in best])
         last = time.perf_counter() - begin
@@ -174,31 +172,28 @@ def _push(rollout: Rollout, bank: HullBank, nodes: list[Node]) -> Pushed:
     return rollout.push(bank, states, actions, real)
 
 
-def _grow(rollout: Rollout, nodes: list[Node], pushed: Pushed) -> None:
-    """Append to every node where its push has led."""
+def _grow(rollout: Rollout, nodes: list[Node], pushed: Pushed) -> list[Node]:
+    """Append to every node where its push has led; return those new ones whose episodes go on."""
     ends, reasons, terminated, safety = jax.device_get(
         (pushed.states, pushed.results.reason, pushed.results.terminated, pushed.safety)
     )
     enclosed = rollout.succeeded(reasons)
     for i, node in enumerate(nodes):
-        so_safe = node.safety * float(safety[i])
+        still_safe = node.safety * float(safety[i])
         child = Node(
             state=jax.tree.map(lambda leaf, i=i: leaf[i], ends),
             proposals=[],
             depth=node.depth + 1,
-            safety=so_safe,
-            promise=float(enclosed[i]) * so_safe * DISCOUNT**node.depth,
-            ended=bool(terminated[i]),
+            safety=still_safe,
+            promise=float(enclosed[i]) * still_safe * DISCOUNT**node.depth,
             ungrasped=bool(enclosed[i]),
         )
         node.children.append(child)
+    return [node.children[-1] for node, ended in zip(nodes, terminated, strict=False) if not ended]
 
 
 def _look_ahead(rollout: Rollout, nodes: list[Node], promise: Promise, left: int) -> None:
-    """Ask the network what follows wherever an episode has not ended; `promise` and `left` are as in `search`."""
-    nodes = [node for node in nodes if not node.ended]
-    if not nodes:
-        return
+    """Ask the network what follows where episodes go on, in one node at least; the rest is as in `search`."""
     proposed = rollout.propose([node.state for node in nodes])
     for node, chance, actions in zip(nodes, promise(proposed.values), proposed.actions.tolist(), strict=True):
         in_time = 1 - (1 - ENDS) ** (left - node.depth)
