@@ -115,8 +115,8 @@ class Rollout:
         """Return what the network would push next in N >= 1 rebuilt scenes, as host arrays."""
         found = []
         for start in range(0, len(states), _ASKED):
-            some = states[start : start + _ASKED]
-            padded = [*some, *[some[-1]] * (_ASKED - len(some))]
+            some = list(states[start : start + _ASKED])
+            padded = some + some[-1:] * (_ASKED - len(some))
             seen = jax.tree.map(lambda *leaves: np.stack(leaves), *((s.obs, s.scene.target) for s in padded))
             found.append(self._ask(self._params, *seen))
         return Proposed(*(np.concatenate(parts)[: len(states)] for parts in zip(*found, strict=True)))
