@@ -132,6 +132,9 @@ class NetworkConfig:
     """`paper`: Fig. 3 on the whole grid; `compact`: 2 cm patches of a window around the hand, for CPUs."""
     width: float = 1.0
     """Factor on all channel counts; 1.0 is the paper's 7.4 M parameters, 0.25 has 0.46 M (compact: 0.12 M)."""
+    fine_channels: int | None = None
+    """Compact: channels of a second readout that tells cells of 5 mm apart; with 0 values of 2 cm are interpolated.
+    None takes as many as `--init-from` has, else 0. It joins a network that has none without changing its values."""
     initial_bias: float = 0.0
     """Q-value of every push before training."""
     mirror: bool = False
@@ -144,6 +147,11 @@ class NetworkConfig:
     def num_members(self) -> int:
         """Return how many networks there are."""
         return self.members or 1
+
+    @property
+    def num_fine_channels(self) -> int:
+        """Return how many channels the second readout has."""
+        return self.fine_channels or 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -322,6 +330,11 @@ class Config:
             raise ValueError(
                 f"scene.min_objects = {self.scene.min_objects} must not exceed scene.max_objects = "
                 f"{self.scene.max_objects}"
+            )
+        if self.network.num_fine_channels and self.network.architecture != "compact":
+            raise ValueError(
+                f"network.fine_channels = {self.network.fine_channels} is of network.architecture = compact; allowed "
+                f"with {self.network.architecture} is 0"
             )
         if not self.exploration.branches:
             for key in ("learner.siblings", "exploration.branch_spacing"):

@@ -22,7 +22,7 @@ from pregrasp_jax.learning.compact import (
     patches,
     window_size,
 )
-from pregrasp_jax.learning.networks import num_parameters
+from pregrasp_jax.learning.networks import num_parameters, with_fine_readout
 from pregrasp_jax.learning.q_function import QFunction, make_q_function
 from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.spaces import grid
@@ -89,16 +89,17 @@ def test_patches_hold_their_own_pixels():
     np.testing.assert_array_equal(np.asarray(patches(jnp.asarray(x)))[1, 1, 2].reshape(4, 4, 3), x[1, 4:8, 8:12])
 
 
-def make_network():
-    network = CompactNetwork(channels=4, blocks=2, initial_bias=0.3)
+def make_network(fine=0):
+    network = CompactNetwork(channels=4, blocks=2, fine=fine, initial_bias=0.3)
     images = jax.random.uniform(jax.random.key(1), (3, *SIZE.shape, 3))
     window = Window(images, jnp.array([[-10, -20], [20, 60], [3, 4]]))
     params = drawn_params(network.init, window)
     return network, params, window
 
 
-def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window():
-    network, params, window = make_network()
+@pytest.mark.parametrize("fine", [0, 3])
+def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window(fine):
+    network, params, window = make_network(fine)
     whole = np.asarray(jax.jit(network.apply)(params, window))
     assert whole.shape == (3, 100, 100, 2) and np.ptp(whole) > 0.1
     actions = [
@@ -109,6 +110,45 @@ def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window
     np.testing.assert_allclose(taken[:2], [whole[0, 9, 30, 1], whole[1, 99, 99, 0]], rtol=1e-5)
     assert taken[2] == whole[2, 80, 3, 1] == 0.0  # left of its window
     assert whole[2, 80, 4, 1] != 0.0
+
+
+def test_fine_channels_lie_where_values_do():
+    """Channels h and -h make relu(h) - relu(-h) = h: what the readout says of patches comes a second time."""
+    plain, params, window = make_network()
+    layers = params["params"]
+    kernel = layers["readout"]["kernel"]
+    signs = jnp.concatenate([jnp.eye(2), -jnp.eye(2)])[None, None]
+    fine = {
+        "fine": {"kernel": jnp.concatenate([kernel, -kernel], axis=-1), "bias": jnp.zeros(4)},
+        "fine_readout": {"kernel": signs, "bias": jnp.zeros(2)},
+    }
+    twice = CompactNetwork(channels=4, blocks=2, fine=4, initial_bias=0.3)
+    once = np.asarray(jax.jit(plain.apply)(params, window))
+    inside = once != 0
+    expected = np.where(inside, 2 * once - np.asarray(layers["readout"]["bias"]), 0)
+    found = np.asarray(jax.jit(twice.apply)({"params": layers | fine}, window))
+    assert inside.mean() > 0.2 and np.ptp(once[inside]) > 0.1
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_fine_channels_join_a_network_without_changing_it_and_learn():
+    task, coarse = TaskConfig(), NetworkConfig(architecture="compact", width=1 / 16, mirror=True, members=2)
+    q = make_q_function(dataclasses.replace(coarse, fine_channels=3), task, ACTIONS)
+    before = make_q_function(coarse, task, ACTIONS)
+    params, obs = drawn_params(before.init), observation((-0.1025, 0.0525))
+    joined = with_fine_readout(params, jax.jit(q.init)(jax.random.key(0, impl="rbg")))
+    assert q.fits(joined) and not q.fits(params) and with_fine_readout(joined, q.shapes) == joined
+    values = (jax.jit(f.values)(p, obs, jnp.int32(1)) for f, p in ((before, params), (q, joined)))
+    np.testing.assert_array_equal(*values)
+    window = jax.tree.map(lambda x: x[None], look_around_hand(obs, jnp.int32(1), size=SIZE))
+    push = jnp.array([ACTIONS.encode(np.int32(60), np.int32(40), np.int32(1))])
+    gradient = jax.jit(jax.grad(lambda p: q.at(p, window, push)[0]))(joined["member1"])
+    assert np.abs(gradient["fine_readout"]["kernel"]).max() > 0.01
+    # Of another width, or of fewer networks, it is another network.
+    narrow = make_q_function(dataclasses.replace(coarse, width=1 / 32, fine_channels=3), task, ACTIONS)
+    assert not narrow.fits(with_fine_readout(params, narrow.shapes))
+    three = make_q_function(dataclasses.replace(coarse, members=3, fine_channels=3), task, ACTIONS)
+    assert with_fine_readout(params, three.shapes) is params
 
 
 def test_coordinates_say_where_patches_lie_in_the_window_and_on_the_table():

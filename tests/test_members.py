@@ -157,12 +157,16 @@ def test_combine_needs_two_policies_and_a_new_folder(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("setting", ["members", "fine_channels"])
 @pytest.mark.parametrize(
     ("asked", "started_from", "found"), [(None, 3, 3), (None, None, None), (2, 3, 2), (2, None, 2)]
 )
-def test_a_training_takes_as_many_networks_as_it_begins_with_unless_it_says_how_many(asked, started_from, found):
-    config = session._as_many_members(of(CONFIG, asked), of(CONFIG, started_from))
-    assert config == of(CONFIG, found)
+def test_a_training_takes_as_many_as_it_begins_with_unless_it_says_how_many(setting, asked, started_from, found):
+    asked, started_from, found = (
+        dataclasses.replace(CONFIG, network=dataclasses.replace(NETWORK, **{setting: count}))
+        for count in (asked, started_from, found)
+    )
+    assert session._like(asked, started_from) == found
 
 
 def test_a_training_says_which_settings_give_the_values_another_meaning():

@@ -5,7 +5,6 @@ and deviation of an image, the window around the hand, the mirror image. It is `
 operation, and tested against it.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -17,8 +16,9 @@ from pregrasp_jax.config import Config
 from pregrasp_jax.export.graph import Graph
 from pregrasp_jax.heightmap import SEGMENTATION
 from pregrasp_jax.heightmap.observation import MIN_STD
-from pregrasp_jax.learning.compact import PATCH, WindowSize, window_size
+from pregrasp_jax.learning.compact import DOUBLINGS, PATCH, WindowSize, window_size
 from pregrasp_jax.learning.members import split
+from pregrasp_jax.learning.networks import FINE, FINE_READOUT, READOUT, upsample_weights
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace
 
@@ -101,21 +101,34 @@ def _compact_values(graph: Graph, params: Params, config: Config, actions: Actio
     x = graph("SpaceToDepth", graph("Transpose", window, perm=[0, 3, 1, 2]), blocksize=PATCH)
     x = graph("Concat", x, _coordinates(graph, origin_rows, origin_cols, (rows - 1, cols)), axis=1)
 
-    def readout(x: str, params: Params) -> str:
-        x = _relu(graph, _conv(graph, x, params["stem"]))
-        for index in range(_count(params, "_in")):
-            hidden = _relu(graph, _conv(graph, x, params[f"block{index}_in"]))
-            x = _relu(graph, graph("Add", x, _conv(graph, hidden, params[f"block{index}_out"])))
-        return _conv(graph, x, params["readout"])
+    def upsampled(x: str) -> str:
+        return _upsample(graph, x, (rows - 1) // PATCH, cols // PATCH, DOUBLINGS)
 
-    q = _mean(graph, [readout(x, member) for member in split(params, config.network.num_members)])
-    q = _upsample(graph, q, (rows - 1) // PATCH, cols // PATCH, int(math.log2(PATCH)))
+    readouts, fine = [], []
+    for member in split(params, config.network.num_members):
+        features = _compact_features(graph, x, member)
+        readouts.append(_conv(graph, features, member[READOUT]))
+        if config.network.num_fine_channels:
+            between = _relu(graph, upsampled(_conv(graph, features, member[FINE])))
+            fine.append(_conv(graph, between, member[FINE_READOUT]))
+    q = upsampled(_mean(graph, readouts))
+    if fine:
+        q = graph("Add", q, _mean(graph, fine))
     q = graph("Transpose", q, perm=[0, 2, 3, 1])
     q = graph("Reshape", q, np.array([0, (rows - 1) * cols, actions.num_choices]))
     q = _paste(graph, q, origin_rows, origin_cols, (rows - 1, cols))
     if not config.network.mirror:
         return q
     return _mean_of_mirrored(graph, q, lambda q: _flip_rows(graph, q, axis=1), actions)
+
+
+def _compact_features(graph: Graph, x: str, params: Params) -> str:
+    """Add the layers of one network before its readouts."""
+    x = _relu(graph, _conv(graph, x, params["stem"]))
+    for index in range(_count(params, "_in")):
+        hidden = _relu(graph, _conv(graph, x, params[f"block{index}_in"]))
+        x = _relu(graph, graph("Add", x, _conv(graph, hidden, params[f"block{index}_out"])))
+    return x
 
 
 def _heights(graph: Graph) -> str:
@@ -257,17 +270,8 @@ def _max_pool(graph: Graph, x: str) -> str:
 
 def _upsample(graph: Graph, x: str, height: int, width: int, doublings: int) -> str:
     """Double images of [batch, C, height, width] bilinearly, corner on corner, so many times; `networks.upsample`."""
-    rows, cols = _doubling(height, doublings), _doubling(width, doublings)
+    rows, cols = (upsample_weights(length, doublings) for length in (height, width))
     return graph("MatMul", graph("MatMul", rows, x), cols.T)
-
-
-def _doubling(length: int, times: int) -> np.ndarray:
-    """Return the weights [2^times * length, length] with which cells of a line are read."""
-    weights = np.eye(length)
-    for _ in range(times):
-        position = np.arange(2 * len(weights)) * ((len(weights) - 1) / (2 * len(weights) - 1))
-        weights = np.maximum(0.0, 1.0 - np.abs(position[:, None] - np.arange(len(weights)))) @ weights
-    return weights.astype(np.float32)
 
 
 def _count(params: Params, part: str) -> int:

@@ -4,6 +4,10 @@ The half ring reaches 0.2 m, so a window around the hand holds all that a push c
 Inside it a patch of 4x4 cells is one position with all of its 16 pixels as channels, and five residual blocks look
 0.22 m in every direction. At 32 channels an update costs a fifth of the paper's network at width 0.25.
 
+Values between the middles of patches are interpolated, so that by themselves they are highest in a middle, and pushes
+lie 2 cm apart. With `fine` channels these are interpolated, too, and only then become values: the best push can
+lie in any cell, as what fits between the fingers within a centimetre needs it.
+
 Because the window moves with the hand, the network also knows where the hand is while it is still outside the picture.
 It is told where every patch lies, in the window and on the table: the edges over which things fall are seldom in view.
 """
@@ -18,12 +22,23 @@ import jax.numpy as jnp
 
 from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.heightmap import SEGMENTATION, network_input
-from pregrasp_jax.learning.networks import READOUT, Conv, upsample
+from pregrasp_jax.learning.networks import (
+    FINE,
+    FINE_READOUT,
+    READOUT,
+    Conv,
+    resample,
+    upsample,
+    upsample_weights,
+)
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.types import HandPose, Observation
 
 PATCH = 4
 """Cells per side of what the network takes for one position."""
+
+DOUBLINGS = int(math.log2(PATCH))
+"""Times that a map of patches is doubled to become one of cells."""
 
 _BEHIND, _BESIDE, _BEYOND = 16, 4, 24
 """Cells of the window behind the hand, and beyond the reach of a push at its sides and ahead of it, where a row of
@@ -126,12 +141,14 @@ class CompactNetwork(nn.Module):
         num_choices: K, values per cell.
         channels: of every layer.
         blocks: residual blocks.
+        fine: F, channels that are interpolated and become values in every cell; 0 interpolates values only.
         initial_bias: Q-value of every push before training.
     """
 
     num_choices: int = 2
     channels: int = 32
     blocks: int = 5
+    fine: int = 0
     initial_bias: float = 0.0
 
     @nn.compact
@@ -144,20 +161,30 @@ class CompactNetwork(nn.Module):
         Returns:
             [B, H, W, K] float32; 0 for pushes that end outside the window.
         """
-        return jax.vmap(paste)(self._q_of_window(window), window.origin)
+        x = self._features(window)
+        q = self._interpolated(x)
+        if self.fine:
+            rows, cols = _weights(x)
+            q += self._fine(x, rows[None], cols[None])
+        return jax.vmap(paste)(q, window.origin)
 
     @nn.compact
     def q_at(self, window: Window, row: jax.Array, col: jax.Array) -> jax.Array:
         """Return ``self(window)[b, row[b], col[b]]``, [B, K], for rows and cols [B] int32 of the grid."""
-        q = self._q_of_window(window)
+        x = self._features(window)
+        q = self._interpolated(x)
         row, col = row - window.origin[:, 0], col - window.origin[:, 1]
-        rows, cols = q.shape[1:3]
-        inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
-        taken = q[jnp.arange(len(row)), jnp.clip(row, 0, rows - 1), jnp.clip(col, 0, cols - 1)]
+        height, width = q.shape[1:3]
+        inside = (row >= 0) & (row < height) & (col >= 0) & (col < width)
+        row, col = jnp.clip(row, 0, height - 1), jnp.clip(col, 0, width - 1)
+        taken = q[jnp.arange(len(row)), row, col]
+        if self.fine:
+            rows, cols = _weights(x)
+            taken += self._fine(x, rows[row][:, None], cols[col][:, None])[:, 0, 0]
         return jnp.where(inside[:, None], taken, 0.0)
 
-    def _q_of_window(self, window: Window) -> jax.Array:
-        """Return [B, R - 1, C, K]: the last row completes no patch, it is there for the mirror image."""
+    def _features(self, window: Window) -> jax.Array:
+        """Return [B, (R - 1) / 4, C / 4, C_out]: the last row completes no patch, it is there for the mirror image."""
         window = window.replace(images=window.images[:, :-1])
         x = window.images
         assert x.ndim == 4 and x.shape[-1] == 3, f"expected [B, R, C, 3], got {x.shape}"
@@ -169,11 +196,29 @@ class CompactNetwork(nn.Module):
             hidden = nn.relu(Conv(self.channels, 3, he, float32, name=f"block{i}_in")(x))
             # Zero at first: a network of identities learns from the first update on.
             x = nn.relu(x + Conv(self.channels, 3, nn.initializers.zeros, float32, name=f"block{i}_out")(hidden))
-        small = nn.initializers.variance_scaling(1e-4, "fan_in", "normal")
-        q = Conv(self.num_choices, 1, small, float32, nn.initializers.constant(self.initial_bias), name=READOUT)(x)
-        for _ in range(int(math.log2(PATCH))):
+        return x
+
+    def _interpolated(self, x: jax.Array) -> jax.Array:
+        """Return the values [B, R - 1, C, K] that patches have, between their middles interpolated."""
+        small, bias = nn.initializers.variance_scaling(1e-4, "fan_in", "normal"), self.initial_bias
+        float32 = jnp.dtype(jnp.float32)
+        q = Conv(self.num_choices, 1, small, float32, nn.initializers.constant(bias), name=READOUT)(x)
+        for _ in range(DOUBLINGS):
             q = upsample(q)
         return q
+
+    def _fine(self, x: jax.Array, rows: jax.Array, cols: jax.Array) -> jax.Array:
+        """Return what every cell adds, [B, R, S, K], of cells that weights [B | 1, R, .] and [B | 1, S, .] read."""
+        float32 = jnp.dtype(jnp.float32)
+        between = resample(Conv(self.fine, 1, nn.initializers.he_normal(), float32, name=FINE)(x), rows, cols)
+        # Zero at first: it may join a network that has learnt without it.
+        return Conv(self.num_choices, 1, nn.initializers.zeros, float32, name=FINE_READOUT)(nn.relu(between))
+
+
+def _weights(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return by which weights [4 N, N] cells of rows and cols lie between the middles of patches [B, N, N, C]."""
+    rows, cols = (jnp.asarray(upsample_weights(length, DOUBLINGS)) for length in x.shape[1:3])
+    return rows, cols
 
 
 def patches(x: jax.Array) -> jax.Array:

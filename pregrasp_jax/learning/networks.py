@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
 from jax.nn.initializers import Initializer
 
 HEIGHT, SEGMENTATION = 0, 1
@@ -20,6 +22,9 @@ HEIGHT, SEGMENTATION = 0, 1
 
 READOUT = "readout"
 """Name of the layer whose outputs are the values, in every network."""
+
+FINE, FINE_READOUT = "fine", "fine_readout"
+"""Names of the layers of a second readout, whose outputs are added; its last one says 0 at first."""
 
 
 def interpolation_weights(positions: jax.Array, num_cells: int) -> jax.Array:
@@ -35,6 +40,15 @@ def interpolation_weights(positions: jax.Array, num_cells: int) -> jax.Array:
 def upsample_positions(indices: jax.Array, num_in: int, num_out: int) -> jax.Array:
     """Return where output cells lie between input cells when the corner cells of both lines coincide."""
     return indices.astype(jnp.float32) * ((num_in - 1) / (num_out - 1))
+
+
+def upsample_weights(num_cells: int, times: int) -> np.ndarray:
+    """Return weights [2^times num_cells, num_cells] that do to a line of cells what `upsample` does so many times."""
+    weights = np.eye(num_cells)
+    for _ in range(times):
+        positions = np.arange(2 * len(weights)) * ((len(weights) - 1) / (2 * len(weights) - 1))
+        weights = np.maximum(0.0, 1.0 - np.abs(positions[:, None] - np.arange(len(weights)))) @ weights
+    return weights.astype(np.float32)
 
 
 def resample(x: jax.Array, rows: jax.Array, cols: jax.Array) -> jax.Array:
@@ -285,3 +299,17 @@ def same_shapes(params: Any, expected: Any) -> bool:
     """Return whether two pytrees of arrays, or of their shapes, have the same structure, shapes and dtypes."""
     shapes = (jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (params, expected))
     return next(shapes) == next(shapes)
+
+
+def with_fine_readout(params: Any, fresh: Any) -> Any:
+    """Return parameters with the second readout of fresh ones, which says 0, if they lack that and nothing else.
+
+    Args:
+        params: of a network or of several.
+        fresh: what the network begins with, arrays or their shapes.
+    """
+    known, wanted = flatten_dict(params), flatten_dict(fresh)
+    missing = {path: leaf for path, leaf in wanted.items() if path not in known}
+    if any(path[-2] not in (FINE, FINE_READOUT) for path in missing):
+        return params
+    return unflatten_dict({**missing, **known})

@@ -65,9 +65,14 @@ class QFunction:
         keys = [key] if self.members == 1 else jax.random.split(key, self.members)
         return join([self.network.init(key, inputs)["params"] for key in keys])
 
+    @property
+    def shapes(self) -> Params:
+        """Return the shapes of the parameters."""
+        return jax.eval_shape(self.init, jax.random.key(0))
+
     def fits(self, params: Params) -> bool:
         """Return whether parameters belong to this network."""
-        return same_shapes(params, jax.eval_shape(self.init, jax.random.key(0)))
+        return same_shapes(params, self.shapes)
 
     def networks(self, params: Params) -> list[Params]:
         """Return the parameters of every member."""
@@ -116,7 +121,7 @@ def make_q_function(network: NetworkConfig, task: TaskConfig, actions: ActionSpa
         return QFunction(paper, actions, network_input, mirror_fn, members=network.num_members)
     channels, size = max(1, round(_COMPACT_CHANNELS * network.width)), window_size(task)
     return QFunction(
-        CompactNetwork(channels=channels, **common),
+        CompactNetwork(channels=channels, fine=network.num_fine_channels, **common),
         actions,
         functools.partial(look_around_hand, size=size),
         mirror_window if network.mirror else None,

@@ -61,18 +61,18 @@ def train(config: Config, run_dir: Path, *, init_from: Path | None = None, conso
     console, config, params = console or _console(), with_absolute_paths(config), None
     if init_from is not None:
         policy = load_policy(init_from)
-        config, params = _as_many_members(config, policy.config), policy.params
+        config, params = _like(config, policy.config), policy.params
         for line in _changed_values(config, policy.config):
             console.say(f"{init_from} was trained with {line}: its values will change")
     return _session(config, run_dir, None, params, console)
 
 
-def _as_many_members(config: Config, started_from: Config) -> Config:
-    """Return a configuration with as many networks as that of the initial parameters, unless it says how many."""
-    if config.network.members is not None or started_from.network.num_members == 1:
-        return config
-    members = started_from.network.members
-    return dataclasses.replace(config, network=dataclasses.replace(config.network, members=members))
+def _like(config: Config, started_from: Config) -> Config:
+    """Return a configuration with as many networks and fine channels as the initial parameters, unless it says."""
+    here, there = config.network, started_from.network
+    members = there.members if here.members is None and there.num_members > 1 else here.members
+    fine = there.fine_channels if here.fine_channels is None and there.num_fine_channels else here.fine_channels
+    return dataclasses.replace(config, network=dataclasses.replace(here, members=members, fine_channels=fine))
 
 
 def _changed_values(config: Config, started_from: Config) -> Iterator[str]:
