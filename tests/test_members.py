@@ -111,29 +111,47 @@ def test_combined_policies_have_the_mean_of_their_values(tmp_path, capsys):
     np.testing.assert_allclose(values_of(three.params, three.config), np.mean(apart, axis=0), atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"task.approach_reward": 0.0}, "task.approach_reward = 0.0"),
-        ({"learner.discount": 0.7}, "learner.discount = 0.7"),
-        ({"network.width": 1 / 16}, "network.width = 0.0625"),
-        ({"network.mirror": False}, "network.mirror = False"),
-        ({"train.try_grasps": True}, "train.try_grasps = True"),
-        ({"train.method": "imitation"}, "learnt by imitation"),
-    ],
-)
-def test_values_that_mean_something_else_are_not_averaged(change, named, tmp_path, capsys):
-    random_policy(tmp_path / "first", CONFIG)
-    config = CONFIG
+def changed(config: Config, change: dict[str, Any]) -> Config:
     for name, value in change.items():
         group, key = name.split(".")
         config = dataclasses.replace(config, **{group: dataclasses.replace(getattr(config, group), **{key: value})})
-    params = random_params(make_q_function(config.network, config.task, ACTIONS))
-    save_policy(tmp_path / "other", params, config, {})
+    return config
+
+
+def save_random(folder: Any, config: Config) -> None:
+    save_policy(folder, random_params(make_q_function(config.network, config.task, ACTIONS)), config, {})
+
+
+REWARDS = [{"task.approach_reward": 0.0}, {"learner.discount": 0.7}, {"train.try_grasps": True}]
+OTHERS = [
+    {"network.width": 1 / 16},
+    {"network.mirror": False},
+    {"network.fine_channels": 2},
+    {"task.workspace": "narrow"},
+    {"train.method": "imitation"},
+]
+
+
+@pytest.mark.parametrize(("change", "any_values"), [(c, False) for c in REWARDS] + [(c, True) for c in OTHERS])
+def test_values_that_mean_something_else_are_not_averaged(change, any_values, tmp_path, capsys):
+    save_random(tmp_path / "first", CONFIG)
+    save_random(tmp_path / "other", changed(CONFIG, change))
+    arguments = [str(tmp_path / "first"), str(tmp_path / "other"), "--out", str(tmp_path / "out")]
     with pytest.raises(SystemExit) as stopped:
-        main(["combine", str(tmp_path / "first"), str(tmp_path / "other"), "--out", str(tmp_path / "out")])
-    assert stopped.value.code == 2 and named in capsys.readouterr().err
+        main(["combine", *arguments, "--any-values", str(any_values)])
+    ((name, value),) = change.items()
+    said = "learnt by imitation" if value == "imitation" else f"{name} = {value}"
+    assert stopped.value.code == 2 and said in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("change", REWARDS)
+def test_what_is_to_be_trained_on_may_have_had_other_rewards(change, tmp_path):
+    save_random(tmp_path / "first", CONFIG)
+    save_random(tmp_path / "other", changed(CONFIG, change))
+    arguments = [str(tmp_path / "first"), str(tmp_path / "other"), "--out", str(tmp_path / "out")]
+    assert main(["combine", *arguments, "--any-values", "True"]) in (0, None)
+    assert load_policy(tmp_path / "out").config == of(CONFIG, 2)
 
 
 def test_combine_needs_two_policies_and_a_new_folder(tmp_path, capsys):

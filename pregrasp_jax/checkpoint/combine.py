@@ -14,11 +14,11 @@ from pregrasp_jax.settings import flatten, to_dict
 _FREE = ("network.members", "network.initial_bias")
 """Settings of the network that may differ."""
 
-_REWARDS = ("learner.discount", "train.try_grasps")
+_REWARDS = ("learner.discount", "train.try_grasps", "task.in_region_reward", "task.approach_reward")
 """Settings of the training on which depends what a value means."""
 
 
-def combine(policies: Sequence[Path | str], folder: Path) -> TrainedPolicy:
+def combine(policies: Sequence[Path | str], folder: Path, *, any_values: bool = False) -> TrainedPolicy:
     """Write the policy whose value of a push is the mean of those of several policies, and return it.
 
     Its configuration is that of the first.
@@ -26,10 +26,12 @@ def combine(policies: Sequence[Path | str], folder: Path) -> TrainedPolicy:
     Args:
         policies: at least two, each as `load_policy` reads it. Of a policy that has several networks each counts.
         folder: of the new policy; must not exist.
+        any_values: they may have been trained for other rewards and discounts; their mean says something only once it
+            has been trained on.
 
     Raises:
         ValueError: one cannot be read, has learnt by imitation, or is of another network, task or discount than the
-            first, so that its values mean something else; or there are too many networks.
+            first (but for `any_values`), so that its values mean something else; or there are too many networks.
     """
     if len(policies) < 2:
         raise ValueError(f"combine needs at least two policies, got {len(policies)}")
@@ -40,7 +42,7 @@ def combine(policies: Sequence[Path | str], folder: Path) -> TrainedPolicy:
     wanted = _meaning(policies[0], loaded[0])
     for path, policy in zip(policies, loaded, strict=True):
         for name, value in _meaning(path, policy).items():
-            if value != wanted[name]:
+            if value != wanted[name] and not (any_values and name in _REWARDS):
                 raise ValueError(
                     f"{path} has {name} = {value}, but {policies[0]} {wanted[name]}: the mean of their values would "
                     f"mean nothing; allowed are policies of one network, task and discount"

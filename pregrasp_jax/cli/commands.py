@@ -67,15 +67,17 @@ def assets(
             _write_image(file, contact_sheet(loaded.bank, eligible))
 
 
-def combine(policies: tuple[str, ...], /, *, out: Path) -> None:
+def combine(policies: tuple[str, ...], /, *, out: Path, any_values: bool = False) -> None:
     """Make one policy of several: the value of a push is the mean of theirs.
 
     Args:
         policies: two or more of one network, task and discount: run folders (the best policy of a run), their
             folders `checkpoints` (the latest), policy folders, or pretrained.
         out: folder of the new policy. It is evaluated, exported and trained on like any other.
+        any_values: take policies that were trained for other rewards and discounts, too. What they make together is to
+            be trained on first (`train --init-from`).
     """
-    policy = combine_policies(policies, out)
+    policy = combine_policies(policies, out, any_values=any_values)
     print(f"wrote {out}: the mean of {policy.config.network.num_members} networks")
 
 
