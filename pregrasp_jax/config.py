@@ -133,8 +133,8 @@ class NetworkConfig:
     width: float = 1.0
     """Factor on all channel counts; 1.0 is the paper's 7.4 M parameters, 0.25 has 0.46 M (compact: 0.12 M)."""
     fine_channels: int | None = None
-    """Compact: channels of a second readout that tells cells of 5 mm apart; with 0 values of 2 cm are interpolated.
-    None takes as many as `--init-from` has, else 0. It joins a network that has none without changing its values."""
+    """Compact: channels of a second readout that tells cells of 5 mm apart; None takes those of `--init-from`, else 0,
+    which interpolates values of 2 cm. It joins a network that has none without changing its values."""
     initial_bias: float = 0.0
     """Q-value of every push before training."""
     mirror: bool = False
@@ -326,23 +326,14 @@ class Config:
         check_ranges(self, RANGES)
         if self.task.r_in >= self.task.r_out:
             raise ValueError(f"task.r_in = {self.task.r_in} must be below task.r_out = {self.task.r_out}")
-        if self.scene.min_objects > self.scene.max_objects:
-            raise ValueError(
-                f"scene.min_objects = {self.scene.min_objects} must not exceed scene.max_objects = "
-                f"{self.scene.max_objects}"
-            )
-        if self.network.num_fine_channels and self.network.architecture != "compact":
-            raise ValueError(
-                f"network.fine_channels = {self.network.fine_channels} is of network.architecture = compact; allowed "
-                f"with {self.network.architecture} is 0"
-            )
-        if not self.exploration.branches:
-            for key in ("learner.siblings", "exploration.branch_spacing"):
-                if value := operator.attrgetter(key)(self):
-                    raise ValueError(
-                        f"{key} = {value} is about branches, and there are none; allowed is exploration.branches of "
-                        "1 or more with it"
-                    )
+        if (least := self.scene.min_objects) > (most := self.scene.max_objects):
+            raise ValueError(f"scene.min_objects = {least} must not exceed scene.max_objects = {most}")
+        branches = "branches", self.exploration.branches, "exploration.branches of 1 or more"
+        compact = "patches", self.network.architecture == "compact", "network.architecture = compact"
+        needs = {"network.fine_channels": compact, "learner.siblings": branches, "exploration.branch_spacing": branches}
+        for key, (subject, given, needed) in needs.items():
+            if (value := operator.attrgetter(key)(self)) and not given:
+                raise ValueError(f"{key} = {value} is about {subject}, and there are none; allowed is {needed} with it")
         return self
 
 

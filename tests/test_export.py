@@ -58,7 +58,7 @@ COMPACT = NetworkConfig(architecture="compact", width=1 / 32)
 PAPER = NetworkConfig(architecture="paper", width=1 / 32)
 CASES = [
     (replace(COMPACT, mirror=True), True),
-    (replace(COMPACT, mirror=True, members=2, fine_channels=5), False),
+    (replace(COMPACT, mirror=True, members=2, fine_channels=2), False),
     pytest.param(replace(COMPACT, width=0.25, mirror=True), False, marks=pytest.mark.slow),
     (replace(COMPACT, width=1 / 16, members=3), False),
     (replace(PAPER, mirror=True, members=2), False),
@@ -76,10 +76,10 @@ def test_the_graph_says_what_the_network_says(network, full_ring):
     wanted = np.asarray(jax.jit(policy_function(q_function, params))(**{k: jnp.asarray(v) for k, v in inputs.items()}))
     assert wanted.std() > 1e-3, "a flat map would hide mistakes"
     found = run(model, inputs)
-    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(found, wanted, atol=1e-4)
     np.testing.assert_array_equal(found.reshape(5, -1).argmax(1), wanted.reshape(5, -1).argmax(1))
     alone = run(model, {name: value[2:3] for name, value in inputs.items()})
-    np.testing.assert_allclose(alone, wanted[2:3], rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(alone, wanted[2:3], atol=1e-4)
 
 
 def test_choices_that_the_mirror_swaps_are_swapped():

@@ -140,8 +140,8 @@ def test_values_that_mean_something_else_are_not_averaged(change, any_values, tm
     with pytest.raises(SystemExit) as stopped:
         main(["combine", *arguments, "--any-values", str(any_values)])
     ((name, value),) = change.items()
-    said = "learnt by imitation" if value == "imitation" else f"{name} = {value}"
-    assert stopped.value.code == 2 and said in capsys.readouterr().err
+    said, error = "learnt by imitation" if value == "imitation" else f"{name} = {value}", capsys.readouterr().err
+    assert stopped.value.code == 2 and said in error and ("--any-values True" in error) == (not any_values)
     assert not (tmp_path / "out").exists()
 
 

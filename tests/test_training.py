@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from drawn_params import drawn_params
+from fake_env import ACTIONS
 from fake_training import (
     PictureEnv,
     make_config,
@@ -22,12 +24,13 @@ from fake_training import (
 )
 
 from pregrasp_jax.checkpoint import checksum, load_policy
-from pregrasp_jax.config import ExplorationConfig
+from pregrasp_jax.config import ExplorationConfig, NetworkConfig, TaskConfig
 from pregrasp_jax.learning import learner
 from pregrasp_jax.learning.members import split
+from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.task.primitive import Plan
-from pregrasp_jax.training import learn
+from pregrasp_jax.training import learn, program
 from pregrasp_jax.training.run_folder import RunFolder, stored_config
 from pregrasp_jax.training.trainer import Trainer
 from pregrasp_jax.types import PUSH_REASONS, EnvState, StepResult
@@ -218,6 +221,23 @@ def test_initial_parameters_are_used(tmp_path):
     built = make_program(config, params=params)
     started = built.init(jax.random.key(0)).learning.learner
     assert checksum(started.params) == checksum(started.target_params) == checksum(params)
+
+
+def test_a_policy_gets_the_fine_readout_that_it_lacks():
+    def q_function(fine):
+        network = NetworkConfig(architecture="compact", width=1 / 32, fine_channels=fine)
+        return make_q_function(network, TaskConfig(), ACTIONS)
+
+    env: Any = PictureEnv()
+    config, q = make_config(), q_function(3)
+    config = dataclasses.replace(config, network=dataclasses.replace(config.network, fine_channels=3))
+    params = drawn_params(q_function(None).init)
+    built = program.make_program(env, config, params=params, q_function=q)
+    started = jax.jit(lambda key: built.init(key).learning.learner)(jax.random.key(0)).params
+    assert q.fits(started) and not started["fine_readout"]["kernel"].any() and started["fine"]["kernel"].any()
+    assert checksum({name: started[name] for name in params}) == checksum(params)
+    with pytest.raises(ValueError, match=r"network.fine_channels = 3 or none"):
+        program.make_program(env, config, params=drawn_params(q_function(2).init), q_function=q)
 
 
 def test_updates_due_add_up_over_fractions():

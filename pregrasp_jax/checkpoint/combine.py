@@ -43,9 +43,10 @@ def combine(policies: Sequence[Path | str], folder: Path, *, any_values: bool = 
     for path, policy in zip(policies, loaded, strict=True):
         for name, value in _meaning(path, policy).items():
             if value != wanted[name] and not (any_values and name in _REWARDS):
+                learnable = ", or --any-values True and to train on what comes out" if name in _REWARDS else ""
                 raise ValueError(
                     f"{path} has {name} = {value}, but {policies[0]} {wanted[name]}: the mean of their values would "
-                    f"mean nothing; allowed are policies of one network, task and discount"
+                    f"mean nothing; allowed are policies of one network, task and discount{learnable}"
                 )
     networks = [params for path, policy in zip(policies, loaded, strict=True) for params in _networks(path, policy)]
     most = int(RANGES["network.members"][1])

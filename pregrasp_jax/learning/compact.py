@@ -4,9 +4,8 @@ The half ring reaches 0.2 m, so a window around the hand holds all that a push c
 Inside it a patch of 4x4 cells is one position with all of its 16 pixels as channels, and five residual blocks look
 0.22 m in every direction. At 32 channels an update costs a fifth of the paper's network at width 0.25.
 
-Values between the middles of patches are interpolated, so that by themselves they are highest in a middle, and pushes
-lie 2 cm apart. With `fine` channels these are interpolated, too, and only then become values: the best push can
-lie in any cell, as what fits between the fingers within a centimetre needs it.
+Values between the middles of patches are interpolated, so that by themselves they know nothing narrower than 2 cm.
+`fine` channels are interpolated before they become values, and with them cells of 5 mm can differ as much as they need.
 
 Because the window moves with the hand, the network also knows where the hand is while it is still outside the picture.
 It is told where every patch lies, in the window and on the table: the edges over which things fall are seldom in view.

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from pregrasp_jax.checkpoint import load_policy
-from pregrasp_jax.config import PUSHING
+from pregrasp_jax.config import PUSHING, NetworkConfig
 from pregrasp_jax.evaluation.player import refuse_unknown_policy
 from pregrasp_jax.messages import lookup
 from pregrasp_jax.robot import ROBOTS
@@ -39,12 +39,22 @@ def check_names(spec: Spec, *, here: Path = Path()) -> None:
         if (start := about.get("init_from")) is not None:
             network = trial_config(spec, {**spec.set, **varied}).network
             begun = load_policy(start if start in PUSHING else here / start).config.network
-            for key in ("architecture", "width"):
-                if (found := getattr(begun, key)) != (wanted := getattr(network, key)):
-                    raise ValueError(
-                        f"variants.{about['name']}.init_from = {start!r} has network.{key} = {found}, but is to go on "
-                        f"with {wanted}; allowed is one value"
-                    )
+            for key, found, wanted in _differences(begun, network):
+                raise ValueError(
+                    f"variants.{about['name']}.init_from = {start!r} has network.{key} = {found}, but is to go on "
+                    f"with {wanted}; allowed is one value"
+                )
+
+
+def _differences(begun: NetworkConfig, network: NetworkConfig) -> Iterator[tuple[str, Any, Any]]:
+    """Yield by which settings, and how, the network that a training begins with is not the one that it asks for."""
+    for key in ("architecture", "width"):
+        if (found := getattr(begun, key)) != (wanted := getattr(network, key)):
+            yield key, found, wanted
+    if network.members not in (None, begun.num_members):
+        yield "members", begun.num_members, network.members
+    if begun.num_fine_channels and network.fine_channels not in (None, begun.num_fine_channels):
+        yield "fine_channels", begun.num_fine_channels, network.fine_channels
 
 
 def _given(spec: Spec) -> Iterator[tuple[str, str]]:
