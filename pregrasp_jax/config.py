@@ -198,6 +198,8 @@ class LearnerConfig:
     """Updates per env step (a push of one scene); 16 scenes at 0.25 make 4 updates per parallel step."""
     siblings: bool = False
     """Learn from all pushes that were made from a state (`exploration.branches`) whenever one of them is sampled."""
+    valued_share: float = 1.0
+    """Share of a batch whose next states are valued anew, ends of episodes last; the others keep their last value."""
     warmup: int = 500
     """Env steps with `exploration.epsilon_start` before the first update."""
 

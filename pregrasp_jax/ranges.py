@@ -39,6 +39,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "learner.huber_delta": (1e-4, 100.0),
     "learner.batch_size": (1, 4096),
     "learner.updates_per_step": (0.0, 100.0),
+    "learner.valued_share": (0.01, 1.0),
     "learner.warmup": (0, 10_000_000),
     "exploration.epsilon_start": (0.0, 1.0),
     "exploration.epsilon_end": (0.0, 1.0),

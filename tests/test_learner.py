@@ -213,6 +213,39 @@ def test_siblings_share_a_state_and_keep_the_values_they_had():
     assert float(metrics["train/target_max"]) == 45.0
 
 
+def test_half_of_the_next_states_are_valued_those_that_have_no_value_first():
+    """Six pushes: two ended, of the four others two have the value 7 of before."""
+    ended = jnp.array([True, False, False, True, False, False])
+    stored = jnp.array([UNKNOWN, 7.0, UNKNOWN, UNKNOWN, UNKNOWN, 7.0])
+    batch = make_batch([0] * 6, [1] * 6, terminated=ended, next_values=jnp.where(ended, 0.0, stored))
+    config = LearnerConfig(valued_share=0.5)
+    valued_states = []
+
+    def counted(params, inputs):
+        valued_states.append(len(inputs))
+        return tabular(params, inputs)
+
+    _, errors, values, _ = run_update(jnp.stack([Q, 10 * Q]), batch, q=table(counted), config=config)
+    assert valued_states == [3]
+    np.testing.assert_allclose(values[:, 0], [0.0, 90.0, 90.0, 0.0, 90.0, 7.0])
+    np.testing.assert_allclose(errors[:, 0], [1.0, 1.0 - 45.0, 1.0 - 45.0, 1.0, 1.0 - 45.0, 1.0 - 3.5])
+
+
+def test_what_has_no_value_and_gets_none_is_left_out():
+    batch = make_batch([0] * 4, [1] * 4)
+    config = LearnerConfig(valued_share=0.25)
+    state, errors, values, _ = run_update(jnp.stack([Q, 10 * Q]), batch, config=config)
+    np.testing.assert_allclose(values[:, 0], [90.0, UNKNOWN, UNKNOWN, UNKNOWN])
+    np.testing.assert_allclose(errors[:, 0], [1.0 - 45.0, 0.0, 0.0, 0.0])
+    assert float(state.params[0, 0, 0, 0]) == pytest.approx(1.0 + 0.1), "the mean is over the one that counts"
+
+
+def test_samples_of_a_kind_take_turns():
+    batch = make_batch([0] * 5, [1] * 5, terminated=jnp.array([False, True, False, False, False]))
+    chosen = [learner.to_value(batch, 2, jnp.int32(turn)).tolist() for turn in range(5)]
+    assert chosen == [[0, 2], [2, 3], [2, 3], [3, 4], [4, 0]]
+
+
 def test_targets_come_from_the_target_network():
     optimizer = optax.sgd(0.0)
     state = learner.init(jnp.zeros((1, H, W, 2)), optimizer).replace(target_params=Q[None])

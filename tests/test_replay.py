@@ -309,6 +309,16 @@ def test_what_is_known_after_an_update_stays_with_the_rows(key):
     np.testing.assert_array_equal(after.priorities.leaves[rest], memory.priorities.leaves[rest])
 
 
+def test_a_row_that_was_drawn_twice_keeps_the_value_that_one_of_them_got(key):
+    memory = with_siblings(2, 3)
+    batch = sample(memory, key, importance_exponent=0.5)
+    twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf[:1]]), batch)
+    for valued in (0, 1):
+        values = jnp.where(twice.drawn & (jnp.arange(2) == valued)[:, None], 5.0, twice.next_values)
+        after = replay.learned(memory, twice, jnp.zeros_like(values), values, priority_exponent=1.0)
+        assert float(after.rows.next_value[batch.rows[0][batch.drawn[0]][0]]) == 5.0
+
+
 def test_a_state_is_weighed_by_how_often_any_of_its_pushes_is_drawn(key):
     memory = with_siblings(2, 2)
     memory = set_priorities(memory, jnp.arange(18), jnp.linspace(0.1, 3.0, 18))

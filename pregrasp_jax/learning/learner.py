@@ -5,6 +5,7 @@ vmaps, weights and averages. Nothing here knows which actions are allowed: ``mas
 """
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -113,15 +114,18 @@ def update(
         mask_fn: which actions are allowed.
         successes: reasons that count as success.
         optimizer: see `training.learn.make_optimizer`.
-        config: discount, polyak, loss.
+        config: discount, polyak, loss, and how many of the next states are valued.
 
     Returns:
         The next state, TD errors [B, K] of the mean of all members, signed, 0 where nothing is known of the next state,
         the values [B, K] of the next states, `UNKNOWN` where they are not, and metrics () each.
     """
-    masks = jax.vmap(mask_fn)(batch.next_hand)
-    fresh = jax.vmap(max_q)(q.apply(state.target_params, batch.next_inputs), masks)
-    values = jnp.where(batch.drawn, fresh[:, None], batch.next_values)
+    count = max(1, math.ceil(config.valued_share * len(batch.drawn)))
+    chosen = to_value(batch, count, state.gradient_steps)
+    inputs, hands = jax.tree.map(lambda leaf: leaf[chosen], (batch.next_inputs, batch.next_hand))
+    fresh = jax.vmap(max_q)(q.apply(state.target_params, inputs), jax.vmap(mask_fn)(hands))
+    stored = batch.next_values
+    values = stored.at[chosen].set(jnp.where(batch.drawn[chosen], fresh[:, None], stored[chosen]))
     known = values > UNKNOWN
     discounted = functools.partial(td_target, discount=config.discount)
     targets = jax.vmap(jax.vmap(discounted))(batch.reward, batch.terminated, jnp.where(known, values, 0.0))
@@ -147,6 +151,27 @@ def update(
         gradient_steps=state.gradient_steps + 1,
     )
     return next_state, errors, values, _metrics(batch, loss, errors, targets, known, grads, successes)
+
+
+def to_value(batch: Batch, count: int, turn: jax.Array) -> jax.Array:
+    """Return which `count` of B samples get their next state valued, [count] int32.
+
+    First those whose next state has no value yet, then those that have one, last those that ended and need none; of a
+    kind by turns, since samples are in the order of their rows.
+
+    Args:
+        batch: B samples.
+        count: 1 to B.
+        turn: () int32, at which of B positions a kind begins.
+    """
+    size = len(batch.drawn)
+    if count == size:
+        return jnp.arange(size)
+    ended = jnp.any(batch.drawn & batch.terminated, axis=1)
+    valued = jnp.any(batch.drawn & (batch.next_values > UNKNOWN), axis=1)
+    rank = jnp.where(ended, 2, jnp.where(valued, 1, 0))
+    place = (jnp.arange(size) - turn) % size
+    return jnp.argsort(rank * size + place)[:count]
 
 
 def sample_and_update(

@@ -61,7 +61,8 @@ class Rows(struct.PyTreeNode):
         hindsight: bool, `goal` was not the target when the push was made.
         outcome: what the push did, for any goal.
         siblings: [..., K] int32 rows of pushes from the same state for the same goal, this one included; -1 for none.
-        next_value: float32 value of the next state when the row was last drawn; 0 if it terminated, else `UNKNOWN`.
+        next_value: float32 value of the next state when it was last looked at; before that 0 if it terminated, else
+            `UNKNOWN`.
     """
 
     obs_slot: jax.Array
@@ -135,7 +136,7 @@ class Batch(struct.PyTreeNode):
         importance_weights: [B] float32 in (0, 1], largest 1.
         hindsight: [B] bool.
         rows: [B, K] int32, for `set_priorities`; -1 for none.
-        drawn: [B, K] bool, which one was drawn; its next state is the only one that is looked at.
+        drawn: [B, K] bool, which one was drawn; its next state is the only one that may be looked at.
         next_values: [B, K] float32 of the next states when they were last looked at, `UNKNOWN` if never.
         action: [B, K] int32.
         reward: [B, K] float32.

@@ -6,7 +6,7 @@ priority, for ever, in the same `add` that overwrites one of its observations, a
 never to overwrite a row that is still alive.
 
 Pushes from one state share its picture, so one pass of the network can learn from all of them. Rows name their
-siblings, and keep the value of the state that they lead to as it was when they were last drawn themselves.
+siblings, and keep the value of the state that they lead to as it was when it was last looked at.
 
 Source: Schaul et al. 2016 (proportional variant); Sec. III-E of the paper.
 """
@@ -199,9 +199,9 @@ def learned(
     known = (batch.rows >= 0) & (values > UNKNOWN)
     rows = jnp.where(known, batch.rows, replay.priorities.capacity).ravel()
     replay = set_priorities(replay, rows, td_errors.ravel(), priority_exponent=priority_exponent)
-    # Only these are news, and what a row that was drawn twice gets is the same.
-    drawn = jnp.where(batch.drawn, batch.rows, replay.priorities.capacity)
-    next_value = replay.rows.next_value.at[drawn].set(values, mode="drop")
+    # Only these are news, and all that a row gets that was drawn twice is the same.
+    news = jnp.where(values != batch.next_values, batch.rows, replay.priorities.capacity)
+    next_value = replay.rows.next_value.at[news].set(values, mode="drop")
     return replay.replace(rows=replay.rows.replace(next_value=next_value))
 
 
