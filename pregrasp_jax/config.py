@@ -132,9 +132,9 @@ class NetworkConfig:
     """`paper`: Fig. 3 on the whole grid; `compact`: 2 cm patches of a window around the hand, for CPUs."""
     width: float = 1.0
     """Factor on all channel counts; 1.0 is the paper's 7.4 M parameters, 0.25 has 0.46 M (compact: 0.12 M)."""
-    fine_channels: int | None = None
-    """Compact: channels of a second readout that tells cells of 5 mm apart; None takes those of `--init-from`, else 0,
-    which interpolates values of 2 cm. It joins a network that has none without changing its values."""
+    path_channels: int | None = None
+    """Compact: channels of a second readout, which looks along the way of a push and tells cells of 5 mm apart; None
+    takes those of `--init-from`, else 0. It joins a network that has none without changing its values."""
     initial_bias: float = 0.0
     """Q-value of every push before training."""
     mirror: bool = False
@@ -149,9 +149,9 @@ class NetworkConfig:
         return self.members or 1
 
     @property
-    def num_fine_channels(self) -> int:
+    def num_path_channels(self) -> int:
         """Return how many channels the second readout has."""
-        return self.fine_channels or 0
+        return self.path_channels or 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,7 +332,7 @@ class Config:
             raise ValueError(f"scene.min_objects = {least} must not exceed scene.max_objects = {most}")
         branches = "branches", self.exploration.branches, "exploration.branches of 1 or more"
         compact = "patches", self.network.architecture == "compact", "network.architecture = compact"
-        needs = {"network.fine_channels": compact, "learner.siblings": branches, "exploration.branch_spacing": branches}
+        needs = {"network.path_channels": compact, "learner.siblings": branches, "exploration.branch_spacing": branches}
         for key, (subject, given, needed) in needs.items():
             if (value := operator.attrgetter(key)(self)) and not given:
                 raise ValueError(f"{key} = {value} is about {subject}, and there are none; allowed is {needed} with it")

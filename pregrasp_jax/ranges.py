@@ -22,7 +22,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "task.push_speed": (0.02, 1.0),
     "physics.threads": (0, 1024),
     "network.width": (1 / 32, 4.0),
-    "network.fine_channels": (0, 1024),
+    "network.path_channels": (0, 1024),
     "network.initial_bias": (-4.0, 4.0),
     "network.members": (1, 16),
     "replay.capacity": (64, 10_000_000),

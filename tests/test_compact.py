@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,9 +21,10 @@ from pregrasp_jax.learning.compact import (
     look_around_hand,
     paste,
     patches,
+    way_weights,
     window_size,
 )
-from pregrasp_jax.learning.networks import num_parameters, with_fine_readout
+from pregrasp_jax.learning.networks import num_parameters, with_path_readout
 from pregrasp_jax.learning.q_function import QFunction, make_q_function
 from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.spaces import grid
@@ -89,17 +91,17 @@ def test_patches_hold_their_own_pixels():
     np.testing.assert_array_equal(np.asarray(patches(jnp.asarray(x)))[1, 1, 2].reshape(4, 4, 3), x[1, 4:8, 8:12])
 
 
-def make_network(fine=0):
-    network = CompactNetwork(channels=4, blocks=2, fine=fine, initial_bias=0.3)
+def make_network(path=0):
+    network = CompactNetwork(channels=4, blocks=2, path=path, behind=SIZE.behind, initial_bias=0.3)
     images = jax.random.uniform(jax.random.key(1), (3, *SIZE.shape, 3))
     window = Window(images, jnp.array([[-10, -20], [20, 60], [3, 4]]))
     params = drawn_params(network.init, window)
     return network, params, window
 
 
-@pytest.mark.parametrize("fine", [0, 3])
-def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window(fine):
-    network, params, window = make_network(fine)
+@pytest.mark.parametrize("path", [0, 3])
+def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window(path):
+    network, params, window = make_network(path)
     whole = np.asarray(jax.jit(network.apply)(params, window))
     assert whole.shape == (3, 100, 100, 2) and np.ptp(whole) > 0.1
     actions = [
@@ -112,43 +114,72 @@ def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window
     assert whole[2, 80, 4, 1] != 0.0
 
 
-def test_fine_channels_lie_where_values_do():
-    """Channels h and -h make relu(h) - relu(-h) = h: what the readout says of patches comes a second time."""
-    plain, params, window = make_network()
+def test_ways_from_the_hand_are_read_between_the_middles_of_patches():
+    """A line of 6 patches, the hand in cell 8: patches that hold their own position are read at the looks' positions."""
+    weights = way_weights(6, 8)
+    assert weights.shape == (24, 5, 6)
+    corner_on_corner = np.arange(6) * 23 / 5
+    for cell in range(24):
+        seen = [min(max(8 + share * (cell - 8), 0.0), 23.0) for share in (0.25, 0.5, 0.75, 1.0, 1.3)]
+        np.testing.assert_allclose(weights[cell] @ corner_on_corner, seen, atol=1e-4)
+        assert np.count_nonzero(weights[cell], axis=1).max() <= 2
+    np.testing.assert_allclose(weights.sum(axis=2), 1.0, atol=1e-6)
+
+
+class Features(CompactNetwork):
+    """The same network without its readouts."""
+
+    @nn.compact
+    def __call__(self, window):
+        return self._features(window)
+
+
+def test_the_second_readout_adds_what_lies_on_the_way():
+    """By hand, in loops: for one push, every look reads its point between four patches."""
+    network, params, window = make_network(3)
     layers = params["params"]
-    kernel = layers["readout"]["kernel"]
-    signs = jnp.concatenate([jnp.eye(2), -jnp.eye(2)])[None, None]
-    fine = {
-        "fine": {"kernel": jnp.concatenate([kernel, -kernel], axis=-1), "bias": jnp.zeros(4)},
-        "fine_readout": {"kernel": signs, "bias": jnp.zeros(2)},
-    }
-    twice = CompactNetwork(channels=4, blocks=2, fine=4, initial_bias=0.3)
-    once = np.asarray(jax.jit(plain.apply)(params, window))
-    inside = once != 0
-    expected = np.where(inside, 2 * once - np.asarray(layers["readout"]["bias"]), 0)
-    found = np.asarray(jax.jit(twice.apply)({"params": layers | fine}, window))
-    assert inside.mean() > 0.2 and np.ptp(once[inside]) > 0.1
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    plain = CompactNetwork(channels=4, blocks=2, initial_bias=0.3)
+    first = {name: layer for name, layer in layers.items() if "path" not in name}
+    gain = np.asarray(jax.jit(network.apply)(params, window) - jax.jit(plain.apply)({"params": first}, window))
+    features = np.asarray(Features(channels=4, blocks=2).apply(params, window))
+    kernel, bias = np.asarray(layers["path"]["kernel"])[0, 0], np.asarray(layers["path"]["bias"])
+    for scene, row, col in ((0, 30, 40), (2, 71, 11), (2, 12, 33)):
+        height, width = features.shape[1:3]
+        total = np.zeros(3)
+        for look, share in enumerate((0.25, 0.5, 0.75, 1.0, 1.3)):
+            r = np.clip(SIZE.beside + share * (row - SIZE.beside), 0, 4 * height - 1) * (height - 1) / (4 * height - 1)
+            c = np.clip(SIZE.behind + share * (col - SIZE.behind), 0, 4 * width - 1) * (width - 1) / (4 * width - 1)
+            total += bias[3 * look : 3 * look + 3]
+            for i in range(height):
+                for j in range(width):
+                    weight = max(0.0, 1 - abs(r - i)) * max(0.0, 1 - abs(c - j))
+                    total += weight * features[scene, i, j] @ kernel[:, 3 * look : 3 * look + 3]
+        expected = np.maximum(total, 0) @ np.asarray(layers["path_readout"]["kernel"])[0, 0]
+        expected += np.asarray(layers["path_readout"]["bias"])
+        origin = np.asarray(window.origin[scene])
+        found = gain[scene, row + origin[0], col + origin[1]]
+        np.testing.assert_allclose(found, expected, atol=1e-4)
+        assert np.abs(expected).max() > 1e-3
 
 
-def test_fine_channels_join_a_network_without_changing_it_and_learn():
-    task, coarse = TaskConfig(), NetworkConfig(architecture="compact", width=1 / 16, mirror=True, members=2)
-    q = make_q_function(dataclasses.replace(coarse, fine_channels=3), task, ACTIONS)
-    before = make_q_function(coarse, task, ACTIONS)
+def test_a_second_readout_joins_a_network_without_changing_it_and_learns():
+    task, first = TaskConfig(), NetworkConfig(architecture="compact", width=1 / 16, mirror=True, members=2)
+    q = make_q_function(dataclasses.replace(first, path_channels=3), task, ACTIONS)
+    before = make_q_function(first, task, ACTIONS)
     params, obs = drawn_params(before.init), observation((-0.1025, 0.0525))
-    joined = with_fine_readout(params, jax.jit(q.init)(jax.random.key(0, impl="rbg")))
-    assert q.fits(joined) and not q.fits(params) and with_fine_readout(joined, q.shapes) == joined
+    joined = with_path_readout(params, jax.jit(q.init)(jax.random.key(0, impl="rbg")))
+    assert q.fits(joined) and not q.fits(params) and with_path_readout(joined, q.shapes) == joined
     values = (jax.jit(f.values)(p, obs, jnp.int32(1)) for f, p in ((before, params), (q, joined)))
     np.testing.assert_array_equal(*values)
     window = jax.tree.map(lambda x: x[None], look_around_hand(obs, jnp.int32(1), size=SIZE))
     push = jnp.array([ACTIONS.encode(np.int32(60), np.int32(40), np.int32(1))])
     gradient = jax.jit(jax.grad(lambda p: q.at(p, window, push)[0]))(joined["member1"])
-    assert np.abs(gradient["fine_readout"]["kernel"]).max() > 0.01
+    assert np.abs(gradient["path_readout"]["kernel"]).max() > 0.01
     # Of another width, or of fewer networks, it is another network.
-    narrow = make_q_function(dataclasses.replace(coarse, width=1 / 32, fine_channels=3), task, ACTIONS)
-    assert not narrow.fits(with_fine_readout(params, narrow.shapes))
-    three = make_q_function(dataclasses.replace(coarse, members=3, fine_channels=3), task, ACTIONS)
-    assert with_fine_readout(params, three.shapes) is params
+    narrow = make_q_function(dataclasses.replace(first, width=1 / 32, path_channels=3), task, ACTIONS)
+    assert not narrow.fits(with_path_readout(params, narrow.shapes))
+    three = make_q_function(dataclasses.replace(first, members=3, path_channels=3), task, ACTIONS)
+    assert with_path_readout(params, three.shapes) is params
 
 
 def test_coordinates_say_where_patches_lie_in_the_window_and_on_the_table():

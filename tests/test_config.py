@@ -73,8 +73,8 @@ def test_what_is_wrong_is_named_with_what_is_allowed(values, said):
 def test_settings_that_contradict_each_other():
     with pytest.raises(ValueError, match=r"task.r_in = 0.3 must be below task.r_out = 0.2"):
         Config.from_dict({"task": {"r_in": 0.3}}).validate()
-    with pytest.raises(ValueError, match=r"network.fine_channels = 8 is about patches.*; allowed is .* compact"):
-        Config.from_dict({"network": {"fine_channels": 8}}).validate()
+    with pytest.raises(ValueError, match=r"network.path_channels = 8 is about patches.*; allowed is .* compact"):
+        Config.from_dict({"network": {"path_channels": 8}}).validate()
     with pytest.raises(ValueError, match=r"learner.siblings = True is about branches.* exploration.branches of 1"):
         Config.from_dict({"learner": {"siblings": True}}).validate()
     with pytest.raises(ValueError, match=r"exploration.branch_spacing = 0.02 is about branches"):

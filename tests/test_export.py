@@ -58,7 +58,7 @@ COMPACT = NetworkConfig(architecture="compact", width=1 / 32)
 PAPER = NetworkConfig(architecture="paper", width=1 / 32)
 CASES = [
     (replace(COMPACT, mirror=True), True),
-    (replace(COMPACT, mirror=True, members=2, fine_channels=2), False),
+    (replace(COMPACT, mirror=True, members=2, path_channels=2), False),
     pytest.param(replace(COMPACT, width=0.25, mirror=True), False, marks=pytest.mark.slow),
     (replace(COMPACT, width=1 / 16, members=3), False),
     (replace(PAPER, mirror=True, members=2), False),

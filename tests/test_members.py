@@ -126,7 +126,7 @@ REWARDS = [{"task.approach_reward": 0.0}, {"learner.discount": 0.7}, {"train.try
 OTHERS = [
     {"network.width": 1 / 16},
     {"network.mirror": False},
-    {"network.fine_channels": 2},
+    {"network.path_channels": 2},
     {"task.workspace": "narrow"},
     {"train.method": "imitation"},
 ]
@@ -175,7 +175,7 @@ def test_combine_needs_two_policies_and_a_new_folder(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("setting", ["members", "fine_channels"])
+@pytest.mark.parametrize("setting", ["members", "path_channels"])
 @pytest.mark.parametrize(
     ("asked", "started_from", "found"), [(None, 3, 3), (None, None, None), (2, 3, 2), (2, None, 2)]
 )

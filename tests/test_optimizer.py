@@ -75,9 +75,9 @@ def test_biases_and_the_readout_are_adams(first):
         np.testing.assert_allclose(first[name], adams[name], rtol=1e-5, err_msg=name)
 
 
-@pytest.mark.parametrize(("architecture", "fine"), [("compact", 16), ("paper", None)])
-def test_muon_takes_every_kernel_before_the_readouts(architecture, fine):
-    network = NetworkConfig(architecture=architecture, fine_channels=fine)
+@pytest.mark.parametrize(("architecture", "path"), [("compact", 16), ("paper", None)])
+def test_muon_takes_every_kernel_before_the_readouts(architecture, path):
+    network = NetworkConfig(architecture=architecture, path_channels=path)
     q = make_q_function(network, TaskConfig(), push_actions(get_robot("ur5e_rg2")))
     params = jax.eval_shape(q.init, jax.random.key(0))
     held = jax.eval_shape(make_optimizer(MUON).init, params).inner_states["muon"]

@@ -16,9 +16,9 @@ from pregrasp_jax.config import Config
 from pregrasp_jax.export.graph import Graph
 from pregrasp_jax.heightmap import SEGMENTATION
 from pregrasp_jax.heightmap.observation import MIN_STD
-from pregrasp_jax.learning.compact import DOUBLINGS, PATCH, WindowSize, window_size
+from pregrasp_jax.learning.compact import DOUBLINGS, LOOKS, PATCH, WindowSize, way_weights, window_size
 from pregrasp_jax.learning.members import split
-from pregrasp_jax.learning.networks import FINE, FINE_READOUT, READOUT, upsample_weights
+from pregrasp_jax.learning.networks import PATH, PATH_READOUT, READOUT, upsample_weights
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace
 
@@ -104,16 +104,16 @@ def _compact_values(graph: Graph, params: Params, config: Config, actions: Actio
     def upsampled(x: str) -> str:
         return _upsample(graph, x, (rows - 1) // PATCH, cols // PATCH, DOUBLINGS)
 
-    readouts, fine = [], []
+    readouts, along = [], []
     for member in split(params, config.network.num_members):
         features = _compact_features(graph, x, member)
         readouts.append(_conv(graph, features, member[READOUT]))
-        if config.network.num_fine_channels:
-            between = _relu(graph, upsampled(_conv(graph, features, member[FINE])))
-            fine.append(_conv(graph, between, member[FINE_READOUT]))
+        if config.network.num_path_channels:
+            found = _read_ways(graph, _conv(graph, features, member[PATH]), config.network.num_path_channels, size)
+            along.append(_conv(graph, _relu(graph, found), member[PATH_READOUT]))
     q = upsampled(_mean(graph, readouts))
-    if fine:
-        q = graph("Add", q, _mean(graph, fine))
+    if along:
+        q = graph("Add", q, _mean(graph, along))
     q = graph("Transpose", q, perm=[0, 2, 3, 1])
     q = graph("Reshape", q, np.array([0, (rows - 1) * cols, actions.num_choices]))
     q = _paste(graph, q, origin_rows, origin_cols, (rows - 1, cols))
@@ -129,6 +129,15 @@ def _compact_features(graph: Graph, x: str, params: Params) -> str:
         hidden = _relu(graph, _conv(graph, x, params[f"block{index}_in"]))
         x = _relu(graph, graph("Add", x, _conv(graph, hidden, params[f"block{index}_out"])))
     return x
+
+
+def _read_ways(graph: Graph, parts: str, channels: int, size: WindowSize) -> str:
+    """Read patches [batch, L F, N, M] along the ways of all pushes: [batch, F, 4 N, 4 M]; `CompactNetwork._along`."""
+    rows, cols = (way_weights(cells // PATCH, hand) for cells, hand in zip(size.shape, (size.beside, size.behind), strict=True))
+    looks, height, width = len(LOOKS), rows.shape[2], cols.shape[2]
+    parts = graph("Reshape", parts, np.array([0, looks, channels, height, width]))
+    rows, cols = rows.transpose(1, 0, 2)[:, None], cols.transpose(1, 2, 0)[:, None]
+    return graph("ReduceSum", graph("MatMul", graph("MatMul", rows, parts), cols), np.array([1]), keepdims=0)
 
 
 def _heights(graph: Graph) -> str:

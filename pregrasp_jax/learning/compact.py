@@ -4,8 +4,9 @@ The half ring reaches 0.2 m, so a window around the hand holds all that a push c
 Inside it a patch of 4x4 cells is one position with all of its 16 pixels as channels, and five residual blocks look
 0.22 m in every direction. At 32 channels an update costs a fifth of the paper's network at width 0.25.
 
-Values between the middles of patches are interpolated, so that by themselves they know nothing narrower than 2 cm.
-`fine` channels are interpolated before they become values, and with them cells of 5 mm can differ as much as they need.
+Values between the middles of patches are interpolated, so that by themselves they know nothing narrower than 2 cm, and
+what lies on the way of a push has to reach its end through the blocks. A second readout, of `path` channels, looks at five
+points along the straight way from the hand to every cell and past it, and only then makes a value of what it finds there.
 
 Because the window moves with the hand, the network also knows where the hand is while it is still outside the picture.
 It is told where every patch lies, in the window and on the table: the edges over which things fall are seldom in view.
@@ -18,17 +19,18 @@ import flax.linen as nn
 import flax.struct as struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from pregrasp_jax.config import TaskConfig
 from pregrasp_jax.heightmap import SEGMENTATION, network_input
 from pregrasp_jax.learning.networks import (
-    FINE,
-    FINE_READOUT,
+    PATH,
+    PATH_READOUT,
     READOUT,
     Conv,
-    resample,
+    interpolation_weights,
     upsample,
-    upsample_weights,
+    upsample_positions,
 )
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.types import HandPose, Observation
@@ -38,6 +40,9 @@ PATCH = 4
 
 DOUBLINGS = int(math.log2(PATCH))
 """Times that a map of patches is doubled to become one of cells."""
+
+LOOKS = (0.25, 0.5, 0.75, 1.0, 1.3)
+"""Where the second readout looks, as shares of the way from the hand to the end of a push."""
 
 _BEHIND, _BESIDE, _BEYOND = 16, 4, 24
 """Cells of the window behind the hand, and beyond the reach of a push at its sides and ahead of it, where a row of
@@ -140,14 +145,16 @@ class CompactNetwork(nn.Module):
         num_choices: K, values per cell.
         channels: of every layer.
         blocks: residual blocks.
-        fine: F, channels that are interpolated and become values in every cell; 0 interpolates values only.
+        path: F, channels that are read along the way of every push before they become its value; 0 for none.
+        behind: cells of the window behind the hand, which is in its middle row.
         initial_bias: Q-value of every push before training.
     """
 
     num_choices: int = 2
     channels: int = 32
     blocks: int = 5
-    fine: int = 0
+    path: int = 0
+    behind: int = _BEHIND
     initial_bias: float = 0.0
 
     @nn.compact
@@ -162,9 +169,9 @@ class CompactNetwork(nn.Module):
         """
         x = self._features(window)
         q = self._interpolated(x)
-        if self.fine:
-            rows, cols = _weights(x)
-            q += self._fine(x, rows[None], cols[None])
+        if self.path:
+            rows, cols = self._ways(x)
+            q += self._along(x, rows[None], cols[None])
         return jax.vmap(paste)(q, window.origin)
 
     @nn.compact
@@ -177,9 +184,9 @@ class CompactNetwork(nn.Module):
         inside = (row >= 0) & (row < height) & (col >= 0) & (col < width)
         row, col = jnp.clip(row, 0, height - 1), jnp.clip(col, 0, width - 1)
         taken = q[jnp.arange(len(row)), row, col]
-        if self.fine:
-            rows, cols = _weights(x)
-            taken += self._fine(x, rows[row][:, None], cols[col][:, None])[:, 0, 0]
+        if self.path:
+            rows, cols = self._ways(x)
+            taken += self._along(x, rows[row][:, None], cols[col][:, None])[:, 0, 0]
         return jnp.where(inside[:, None], taken, 0.0)
 
     def _features(self, window: Window) -> jax.Array:
@@ -206,18 +213,35 @@ class CompactNetwork(nn.Module):
             q = upsample(q)
         return q
 
-    def _fine(self, x: jax.Array, rows: jax.Array, cols: jax.Array) -> jax.Array:
-        """Return what every cell adds, [B, R, S, K], of cells that weights [B | 1, R, .] and [B | 1, S, .] read."""
-        float32 = jnp.dtype(jnp.float32)
-        between = resample(Conv(self.fine, 1, nn.initializers.he_normal(), float32, name=FINE)(x), rows, cols)
+    def _ways(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return how the ways to the cells of rows [4 N, L, N] and cols [4 M, L, M] read patches [B, N, M, C]."""
+        height, width = x.shape[1:3]
+        middle = PATCH * height // 2
+        return jnp.asarray(way_weights(height, middle)), jnp.asarray(way_weights(width, self.behind))
+
+    def _along(self, x: jax.Array, rows: jax.Array, cols: jax.Array) -> jax.Array:
+        """Return what the ways of pushes add, [B, R, S, K], that weights [B | 1, R, L, N] and [B | 1, S, L, M] read."""
+        float32, looks = jnp.dtype(jnp.float32), len(LOOKS)
+        # The parts of all looks are added before they become values.
+        init = nn.initializers.variance_scaling(2.0 / looks, "fan_in", "normal")
+        parts = Conv(looks * self.path, 1, init, float32, name=PATH)(x)
+        parts = parts.reshape(*x.shape[:3], looks, self.path)
+        rows, cols = (jnp.broadcast_to(w, (len(x), *w.shape[1:])) for w in (rows, cols))
+        parts = jnp.einsum("brln,bnmlf->brmlf", rows, parts, precision="highest")
+        found = jnp.einsum("bslm,brmlf->brsf", cols, parts, precision="highest")
         # Zero at first: it may join a network that has learnt without it.
-        return Conv(self.num_choices, 1, nn.initializers.zeros, float32, name=FINE_READOUT)(nn.relu(between))
+        return Conv(self.num_choices, 1, nn.initializers.zeros, float32, name=PATH_READOUT)(nn.relu(found))
 
 
-def _weights(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return by which weights [4 N, N] cells of rows and cols lie between the middles of patches [B, N, N, C]."""
-    rows, cols = (jnp.asarray(upsample_weights(length, DOUBLINGS)) for length in x.shape[1:3])
-    return rows, cols
+def way_weights(num_patches: int, hand: int) -> np.ndarray:
+    """Return the weights [4 N, L, N] by which the way from cell `hand` of a line to each of its cells reads N patches.
+
+    At each of `LOOKS` two patches are read, in the proportions in which `upsample` interpolates between them; ways that
+    leave the window end at its border.
+    """
+    cells = np.arange(PATCH * num_patches)
+    seen = np.clip(hand + np.array(LOOKS) * (cells[:, None] - hand), 0, cells[-1])
+    return interpolation_weights(upsample_positions(seen, num_patches, len(cells)), num_patches).astype(np.float32)
 
 
 def patches(x: jax.Array) -> jax.Array:

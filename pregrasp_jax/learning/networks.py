@@ -17,29 +17,32 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from jax.nn.initializers import Initializer
 
+from pregrasp_jax.spaces.arrays import namespace
+
 HEIGHT, SEGMENTATION = 0, 1
 """Channels of the network's input."""
 
 READOUT = "readout"
 """Name of the layer whose outputs are the values, in every network."""
 
-FINE, FINE_READOUT = "fine", "fine_readout"
+PATH, PATH_READOUT = "path", "path_readout"
 """Names of the layers of a second readout, whose outputs are added; its last one says 0 at first."""
 
 
-def interpolation_weights(positions: jax.Array, num_cells: int) -> jax.Array:
+def interpolation_weights(positions: Any, num_cells: int) -> Any:
     """Return weights [..., P, num_cells] that read a line of cells at fractional `positions` [..., P], linearly.
 
     An integer position selects its cell exactly; a position outside the line by one cell or more selects nothing,
     so a window that hangs over the border reads zeros there.
     """
-    cells = jnp.arange(num_cells, dtype=jnp.float32).reshape((1,) * positions.ndim + (num_cells,))
-    return jnp.maximum(0.0, 1.0 - jnp.abs(positions[..., None] - cells))
+    xp = namespace(positions)
+    cells = xp.arange(num_cells, dtype=xp.float32).reshape((1,) * positions.ndim + (num_cells,))
+    return xp.maximum(0.0, 1.0 - xp.abs(positions[..., None] - cells))
 
 
-def upsample_positions(indices: jax.Array, num_in: int, num_out: int) -> jax.Array:
+def upsample_positions(indices: Any, num_in: int, num_out: int) -> Any:
     """Return where output cells lie between input cells when the corner cells of both lines coincide."""
-    return indices.astype(jnp.float32) * ((num_in - 1) / (num_out - 1))
+    return indices.astype(np.float32) * ((num_in - 1) / (num_out - 1))
 
 
 def upsample_weights(num_cells: int, times: int) -> np.ndarray:
@@ -47,7 +50,7 @@ def upsample_weights(num_cells: int, times: int) -> np.ndarray:
     weights = np.eye(num_cells)
     for _ in range(times):
         positions = np.arange(2 * len(weights)) * ((len(weights) - 1) / (2 * len(weights) - 1))
-        weights = np.maximum(0.0, 1.0 - np.abs(positions[:, None] - np.arange(len(weights)))) @ weights
+        weights = interpolation_weights(positions, len(weights)) @ weights
     return weights.astype(np.float32)
 
 
@@ -301,7 +304,7 @@ def same_shapes(params: Any, expected: Any) -> bool:
     return next(shapes) == next(shapes)
 
 
-def with_fine_readout(params: Any, fresh: Any) -> Any:
+def with_path_readout(params: Any, fresh: Any) -> Any:
     """Return parameters with the second readout of fresh ones, which says 0, if they lack that and nothing else.
 
     Args:
@@ -310,6 +313,6 @@ def with_fine_readout(params: Any, fresh: Any) -> Any:
     """
     known, wanted = flatten_dict(params), flatten_dict(fresh)
     missing = {path: leaf for path, leaf in wanted.items() if path not in known}
-    if any(path[-2] not in (FINE, FINE_READOUT) for path in missing):
+    if any(path[-2] not in (PATH, PATH_READOUT) for path in missing):
         return params
     return unflatten_dict({**missing, **known})

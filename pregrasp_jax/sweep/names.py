@@ -53,8 +53,8 @@ def _differences(begun: NetworkConfig, network: NetworkConfig) -> Iterator[tuple
             yield key, found, wanted
     if network.members not in (None, begun.num_members):
         yield "members", begun.num_members, network.members
-    if begun.num_fine_channels and network.fine_channels not in (None, begun.num_fine_channels):
-        yield "fine_channels", begun.num_fine_channels, network.fine_channels
+    if begun.num_path_channels and network.path_channels not in (None, begun.num_path_channels):
+        yield "path_channels", begun.num_path_channels, network.path_channels
 
 
 def _given(spec: Spec) -> Iterator[tuple[str, str]]:

@@ -18,7 +18,7 @@ from pregrasp_jax.config import LearnerConfig, ReplayConfig
 from pregrasp_jax.learning import hindsight, learner
 from pregrasp_jax.learning import replay as replay_lib
 from pregrasp_jax.learning.learner import LearnerState
-from pregrasp_jax.learning.networks import FINE_READOUT, READOUT
+from pregrasp_jax.learning.networks import PATH_READOUT, READOUT
 from pregrasp_jax.learning.q_function import Params
 from pregrasp_jax.learning.records import Replay, Steps
 from pregrasp_jax.policies.exploration import linear_schedule
@@ -155,7 +155,7 @@ def _kernels(params: Params) -> Any:
     """Return which axes of a kernel [rows, cols, C_in, C_out] are those of its matrix; None for all else."""
 
     def matrix(path: tuple[Any, ...], leaf: jax.Array) -> MuonDimensionNumbers | None:
-        readout = any(getattr(key, "key", None) in (READOUT, FINE_READOUT) for key in path)
+        readout = any(getattr(key, "key", None) in (READOUT, PATH_READOUT) for key in path)
         return MuonDimensionNumbers((0, 1, 2), 3) if leaf.ndim == 4 and not readout else None
 
     return jax.tree_util.tree_map_with_path(matrix, params)

@@ -13,7 +13,7 @@ import numpy as np
 
 from pregrasp_jax.checkpoint.chunks import Ring
 from pregrasp_jax.config import Config
-from pregrasp_jax.learning.networks import with_fine_readout
+from pregrasp_jax.learning.networks import with_path_readout
 from pregrasp_jax.learning.q_function import Params, QFunction, make_q_function
 from pregrasp_jax.task.stages import Stages
 from pregrasp_jax.training.collect import Actors, Environment, Experience, init_actors, make_collect
@@ -182,7 +182,7 @@ def make_program(
         experience: Experience = jax.eval_shape(collect, *_shapes((actors, drawn, pace)))[1]
         learning = init_learning(
             learner_key,
-            drawn if params is None else with_fine_readout(params, drawn),
+            drawn if params is None else with_path_readout(params, drawn),
             experience.steps,
             config.replay,
             make_optimizer(config.learner),
@@ -199,11 +199,11 @@ def make_program(
         replay_config=config.replay,
         split_fn=layout.split_batch,
     )
-    if params is not None and not q.fits(with_fine_readout(params, q.shapes)):
+    if params is not None and not q.fits(with_path_readout(params, q.shapes)):
         raise ValueError(
             f"the initial parameters (--init-from) are of another network; allowed is network.architecture = "
             f"{config.network.architecture} and network.width = {config.network.width}, network.members = "
-            f"{config.network.num_members}, and network.fine_channels = {config.network.num_fine_channels} or none"
+            f"{config.network.num_members}, and network.path_channels = {config.network.num_path_channels} or none"
         )
     remember = make_remember(config.replay, env.rules)
     return Program(init, collect, remember, update, env.rules.successes, pace, _num_fused(config), layout=layout)

@@ -68,11 +68,11 @@ def train(config: Config, run_dir: Path, *, init_from: Path | None = None, conso
 
 
 def _like(config: Config, started_from: Config) -> Config:
-    """Return a configuration with as many networks and fine channels as the initial parameters, unless it says."""
+    """Return a configuration with as many networks and path channels as the initial parameters, unless it says."""
     here, there = config.network, started_from.network
     members = there.members if here.members is None and there.num_members > 1 else here.members
-    fine = there.fine_channels if here.fine_channels is None and there.num_fine_channels else here.fine_channels
-    return dataclasses.replace(config, network=dataclasses.replace(here, members=members, fine_channels=fine))
+    path = there.path_channels if here.path_channels is None and there.num_path_channels else here.path_channels
+    return dataclasses.replace(config, network=dataclasses.replace(here, members=members, path_channels=path))
 
 
 def _changed_values(config: Config, started_from: Config) -> Iterator[str]:
