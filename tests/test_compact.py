@@ -115,7 +115,7 @@ def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window
 
 
 def test_ways_from_the_hand_are_read_between_the_middles_of_patches():
-    """A line of 6 patches, the hand in cell 8: patches that hold their own position are read at the looks' positions."""
+    """A line of 6 patches, the hand in cell 8: patches that hold their position are read where the looks are."""
     weights = way_weights(6, 8)
     assert weights.shape == (24, 5, 6)
     corner_on_corner = np.arange(6) * 23 / 5

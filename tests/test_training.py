@@ -223,20 +223,20 @@ def test_initial_parameters_are_used(tmp_path):
     assert checksum(started.params) == checksum(started.target_params) == checksum(params)
 
 
-def test_a_policy_gets_the_fine_readout_that_it_lacks():
-    def q_function(fine):
-        network = NetworkConfig(architecture="compact", width=1 / 32, fine_channels=fine)
+def test_a_policy_gets_the_path_readout_that_it_lacks():
+    def q_function(path):
+        network = NetworkConfig(architecture="compact", width=1 / 32, path_channels=path)
         return make_q_function(network, TaskConfig(), ACTIONS)
 
     env: Any = PictureEnv()
     config, q = make_config(), q_function(3)
-    config = dataclasses.replace(config, network=dataclasses.replace(config.network, fine_channels=3))
+    config = dataclasses.replace(config, network=dataclasses.replace(config.network, path_channels=3))
     params = drawn_params(q_function(None).init)
     built = program.make_program(env, config, params=params, q_function=q)
     started = jax.jit(lambda key: built.init(key).learning.learner)(jax.random.key(0)).params
-    assert q.fits(started) and not started["fine_readout"]["kernel"].any() and started["fine"]["kernel"].any()
+    assert q.fits(started) and not started["path_readout"]["kernel"].any() and started["path"]["kernel"].any()
     assert checksum({name: started[name] for name in params}) == checksum(params)
-    with pytest.raises(ValueError, match=r"network.fine_channels = 3 or none"):
+    with pytest.raises(ValueError, match=r"network.path_channels = 3 or none"):
         program.make_program(env, config, params=drawn_params(q_function(2).init), q_function=q)
 
 

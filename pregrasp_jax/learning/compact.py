@@ -5,8 +5,8 @@ Inside it a patch of 4x4 cells is one position with all of its 16 pixels as chan
 0.22 m in every direction. At 32 channels an update costs a fifth of the paper's network at width 0.25.
 
 Values between the middles of patches are interpolated, so that by themselves they know nothing narrower than 2 cm, and
-what lies on the way of a push has to reach its end through the blocks. A second readout, of `path` channels, looks at five
-points along the straight way from the hand to every cell and past it, and only then makes a value of what it finds there.
+what lies on the way of a push has to reach its end through the blocks. A second readout, of `path` channels, looks at
+five points along the straight way from the hand to every cell and past it, and makes a value of what it finds there.
 
 Because the window moves with the hand, the network also knows where the hand is while it is still outside the picture.
 It is told where every patch lies, in the window and on the table: the edges over which things fall are seldom in view.
