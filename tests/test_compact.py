@@ -92,7 +92,7 @@ def test_patches_hold_their_own_pixels():
 
 
 def make_network(path=0):
-    network = CompactNetwork(channels=4, blocks=2, path=path, behind=SIZE.behind, initial_bias=0.3)
+    network = CompactNetwork(channels=4, blocks=2, path_channels=path, behind=SIZE.behind, initial_bias=0.3)
     images = jax.random.uniform(jax.random.key(1), (3, *SIZE.shape, 3))
     window = Window(images, jnp.array([[-10, -20], [20, 60], [3, 4]]))
     params = drawn_params(network.init, window)

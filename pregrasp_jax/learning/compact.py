@@ -5,7 +5,7 @@ Inside it a patch of 4x4 cells is one position with all of its 16 pixels as chan
 0.22 m in every direction. At 32 channels an update costs a fifth of the paper's network at width 0.25.
 
 Values between the middles of patches are interpolated, so that by themselves they know nothing narrower than 2 cm, and
-what lies on the way of a push has to reach its end through the blocks. A second readout, of `path` channels, looks at
+what lies on the way of a push has to reach its end through the blocks. A second readout, of path channels, looks at
 five points along the straight way from the hand to every cell and past it, and makes a value of what it finds there.
 
 Because the window moves with the hand, the network also knows where the hand is while it is still outside the picture.
@@ -145,7 +145,7 @@ class CompactNetwork(nn.Module):
         num_choices: K, values per cell.
         channels: of every layer.
         blocks: residual blocks.
-        path: F, channels that are read along the way of every push before they become its value; 0 for none.
+        path_channels: F, channels that are read along the way of every push before they become its value; 0 for none.
         behind: cells of the window behind the hand, which is in its middle row.
         initial_bias: Q-value of every push before training.
     """
@@ -153,7 +153,7 @@ class CompactNetwork(nn.Module):
     num_choices: int = 2
     channels: int = 32
     blocks: int = 5
-    path: int = 0
+    path_channels: int = 0
     behind: int = _BEHIND
     initial_bias: float = 0.0
 
@@ -169,7 +169,7 @@ class CompactNetwork(nn.Module):
         """
         x = self._features(window)
         q = self._interpolated(x)
-        if self.path:
+        if self.path_channels:
             rows, cols = self._ways(x)
             q += self._along(x, rows[None], cols[None])
         return jax.vmap(paste)(q, window.origin)
@@ -184,7 +184,7 @@ class CompactNetwork(nn.Module):
         inside = (row >= 0) & (row < height) & (col >= 0) & (col < width)
         row, col = jnp.clip(row, 0, height - 1), jnp.clip(col, 0, width - 1)
         taken = q[jnp.arange(len(row)), row, col]
-        if self.path:
+        if self.path_channels:
             rows, cols = self._ways(x)
             taken += self._along(x, rows[row][:, None], cols[col][:, None])[:, 0, 0]
         return jnp.where(inside[:, None], taken, 0.0)
@@ -224,8 +224,8 @@ class CompactNetwork(nn.Module):
         float32, looks = jnp.dtype(jnp.float32), len(LOOKS)
         # The parts of all looks are added before they become values.
         init = nn.initializers.variance_scaling(2.0 / looks, "fan_in", "normal")
-        parts = Conv(looks * self.path, 1, init, float32, name=PATH)(x)
-        parts = parts.reshape(*x.shape[:3], looks, self.path)
+        parts = Conv(looks * self.path_channels, 1, init, float32, name=PATH)(x)
+        parts = parts.reshape(*x.shape[:3], looks, self.path_channels)
         rows, cols = (jnp.broadcast_to(w, (len(x), *w.shape[1:])) for w in (rows, cols))
         parts = jnp.einsum("brln,bnmlf->brmlf", rows, parts, precision="highest")
         found = jnp.einsum("bslm,brmlf->brsf", cols, parts, precision="highest")
