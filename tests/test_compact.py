@@ -92,7 +92,7 @@ def test_patches_hold_their_own_pixels():
 
 
 def make_network(path=0):
-    network = CompactNetwork(channels=4, blocks=2, path_channels=path, behind=SIZE.behind, initial_bias=0.3)
+    network = CompactNetwork(channels=4, blocks=2, path_channels=path, size=SIZE, initial_bias=0.3)
     images = jax.random.uniform(jax.random.key(1), (3, *SIZE.shape, 3))
     window = Window(images, jnp.array([[-10, -20], [20, 60], [3, 4]]))
     params = drawn_params(network.init, window)
@@ -116,13 +116,13 @@ def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window
 
 def test_ways_from_the_hand_are_read_between_the_middles_of_patches():
     """A line of 6 patches, the hand in cell 8: patches that hold their position are read where the looks are."""
-    weights = way_weights(6, 8)
-    assert weights.shape == (24, 5, 6)
+    weights = way_weights(6, 8, slice(2, 24))
+    assert weights.shape == (22, 5, 6)
     corner_on_corner = np.arange(6) * 23 / 5
-    for cell in range(24):
+    for i, cell in enumerate(range(2, 24)):
         seen = [min(max(8 + share * (cell - 8), 0.0), 23.0) for share in (0.25, 0.5, 0.75, 1.0, 1.3)]
-        np.testing.assert_allclose(weights[cell] @ corner_on_corner, seen, atol=1e-4)
-        assert np.count_nonzero(weights[cell], axis=1).max() <= 2
+        np.testing.assert_allclose(weights[i] @ corner_on_corner, seen, atol=1e-4)
+        assert np.count_nonzero(weights[i], axis=1).max() <= 2
     np.testing.assert_allclose(weights.sum(axis=2), 1.0, atol=1e-6)
 
 
@@ -143,7 +143,7 @@ def test_the_second_readout_adds_what_lies_on_the_way():
     gain = np.asarray(jax.jit(network.apply)(params, window) - jax.jit(plain.apply)({"params": first}, window))
     features = np.asarray(Features(channels=4, blocks=2).apply(params, window))
     kernel, bias = np.asarray(layers["path"]["kernel"])[0, 0], np.asarray(layers["path"]["bias"])
-    for scene, row, col in ((0, 30, 40), (2, 71, 11), (2, 12, 33)):
+    for scene, row, col in ((0, 30, 40), (2, 71, 21), (2, 12, 56)):
         height, width = features.shape[1:3]
         total = np.zeros(3)
         for look, share in enumerate((0.25, 0.5, 0.75, 1.0, 1.3)):
@@ -160,6 +160,22 @@ def test_the_second_readout_adds_what_lies_on_the_way():
         found = gain[scene, row + origin[0], col + origin[1]]
         np.testing.assert_allclose(found, expected, atol=1e-4)
         assert np.abs(expected).max() > 1e-3
+    rows, cols = (np.flatnonzero(np.abs(gain[0]).max(axis=(axis, 2))) for axis in (1, 0))
+    origin = np.asarray(window.origin[0])
+    assert rows.max() - origin[0] == SIZE.beside + 40 and cols.max() - origin[1] == SIZE.behind + 40
+
+
+@pytest.mark.parametrize("full_ring", [False, True])
+def test_all_pushes_are_within_the_reach_of_the_second_readout(full_ring):
+    task = TaskConfig(full_ring=full_ring)
+    size = window_size(task)
+    rows, cols = size.reached
+    for point in ((-0.0025, 0.0525), (-0.2025, -0.1975)):
+        hand = hand_at(point)
+        ends = np.argwhere(np.asarray(grid.half_ring(hand.xy, r_in=task.r_in, r_out=task.r_out, full=full_ring)))
+        row, col = (ends - np.asarray(look_around_hand(observation(point), jnp.int32(1), size=size).origin)).T
+        assert row.min() >= rows.start and row.max() < rows.stop
+        assert col.min() >= cols.start and col.max() < cols.stop
 
 
 def test_a_second_readout_joins_a_network_without_changing_it_and_learns():

@@ -113,7 +113,9 @@ def _compact_values(graph: Graph, params: Params, config: Config, actions: Actio
             along.append(_conv(graph, _relu(graph, found), member[PATH_READOUT]))
     q = upsampled(_mean(graph, readouts))
     if along:
-        q = graph("Add", q, _mean(graph, along))
+        (top, bottom), (left, right) = ((box.start, box.stop) for box in size.reached)
+        beyond = np.array([0, 0, top, left, 0, 0, rows - 1 - bottom, cols - right])
+        q = graph("Add", q, graph("Pad", _mean(graph, along), beyond))
     q = graph("Transpose", q, perm=[0, 2, 3, 1])
     q = graph("Reshape", q, np.array([0, (rows - 1) * cols, actions.num_choices]))
     q = _paste(graph, q, origin_rows, origin_cols, (rows - 1, cols))
@@ -132,9 +134,9 @@ def _compact_features(graph: Graph, x: str, params: Params) -> str:
 
 
 def _read_ways(graph: Graph, parts: str, channels: int, size: WindowSize) -> str:
-    """Read patches [batch, L F, N, M] along the ways of all pushes: [batch, F, 4 N, 4 M]; `CompactNetwork._along`."""
-    lines = zip(size.shape, (size.beside, size.behind), strict=True)
-    rows, cols = (way_weights(cells // PATCH, hand) for cells, hand in lines)
+    """Read patches [batch, L F, N, M] along the ways of pushes: [batch, F, R, S] within reach; `CompactNetwork._along`."""
+    lines = zip(size.shape, (size.beside, size.behind), size.reached, strict=True)
+    rows, cols = (way_weights(cells // PATCH, hand, reached) for cells, hand, reached in lines)
     looks, height, width = len(LOOKS), rows.shape[2], cols.shape[2]
     parts = graph("Reshape", parts, np.array([0, looks, channels, height, width]))
     rows, cols = rows.transpose(1, 0, 2)[:, None], cols.transpose(1, 2, 0)[:, None]

@@ -56,16 +56,26 @@ class WindowSize(NamedTuple):
         beside: to either side (rows).
         behind: cols with smaller x.
         ahead: cols with larger x.
+        reach: of the longest push, to either side and ahead.
+        back: of the longest push, backwards.
     """
 
     beside: int
     behind: int
     ahead: int
+    reach: int
+    back: int
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows, as many on either side of the hand, and columns."""
         return 2 * self.beside + 1, self.behind + self.ahead
+
+    @property
+    def reached(self) -> tuple[slice, slice]:
+        """Rows and columns of the smallest box that holds all ends of pushes."""
+        rows = slice(self.beside - self.reach, self.beside + self.reach + 1)
+        return rows, slice(self.behind - self.back, self.behind + self.reach + 1)
 
 
 class Window(struct.PyTreeNode):
@@ -89,7 +99,8 @@ def window_size(task: TaskConfig) -> WindowSize:
         return PATCH * math.ceil(cells / PATCH)
 
     beside = padded(reach + _BESIDE)
-    return WindowSize(beside=beside, behind=beside if task.full_ring else _BEHIND, ahead=padded(reach + _BEYOND))
+    behind, back = (beside, reach) if task.full_ring else (_BEHIND, 0)
+    return WindowSize(beside=beside, behind=behind, ahead=padded(reach + _BEYOND), reach=reach, back=back)
 
 
 def look_around_hand(obs: Observation, target_slot: jax.Array, *, size: WindowSize) -> Window:
@@ -146,7 +157,7 @@ class CompactNetwork(nn.Module):
         channels: of every layer.
         blocks: residual blocks.
         path_channels: F, channels that are read along the way of every push before they become its value; 0 for none.
-        behind: cells of the window behind the hand, which is in its middle row.
+        size: of the window, where pushes are within reach; needed by path channels only.
         initial_bias: Q-value of every push before training.
     """
 
@@ -154,7 +165,7 @@ class CompactNetwork(nn.Module):
     channels: int = 32
     blocks: int = 5
     path_channels: int = 0
-    behind: int = _BEHIND
+    size: WindowSize | None = None
     initial_bias: float = 0.0
 
     @nn.compact
@@ -170,8 +181,8 @@ class CompactNetwork(nn.Module):
         x = self._features(window)
         q = self._interpolated(x)
         if self.path_channels:
-            rows, cols = self._ways(x)
-            q += self._along(x, rows[None], cols[None])
+            reached, (rows, cols) = self._ways(x)
+            q = q.at[:, *reached].add(self._along(x, rows[None], cols[None]))
         return jax.vmap(paste)(q, window.origin)
 
     @nn.compact
@@ -185,8 +196,11 @@ class CompactNetwork(nn.Module):
         row, col = jnp.clip(row, 0, height - 1), jnp.clip(col, 0, width - 1)
         taken = q[jnp.arange(len(row)), row, col]
         if self.path_channels:
-            rows, cols = self._ways(x)
-            taken += self._along(x, rows[row][:, None], cols[col][:, None])[:, 0, 0]
+            reached, ways = self._ways(x)
+            places = [cell - box.start for cell, box in zip((row, col), reached, strict=True)]
+            rows, cols = (way[place][:, None] for way, place in zip(ways, places, strict=True))
+            within = [(0 <= place) & (place < len(way)) for way, place in zip(ways, places, strict=True)]
+            taken += jnp.where((within[0] & within[1])[:, None], self._along(x, rows, cols)[:, 0, 0], 0.0)
         return jnp.where(inside[:, None], taken, 0.0)
 
     def _features(self, window: Window) -> jax.Array:
@@ -213,11 +227,16 @@ class CompactNetwork(nn.Module):
             q = upsample(q)
         return q
 
-    def _ways(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return how the ways to the cells of rows [4 N, L, N] and cols [4 M, L, M] read patches [B, N, M, C]."""
-        height, width = x.shape[1:3]
-        middle = PATCH * height // 2
-        return jnp.asarray(way_weights(height, middle)), jnp.asarray(way_weights(width, self.behind))
+    def _ways(self, x: jax.Array) -> tuple[tuple[slice, slice], tuple[jax.Array, jax.Array]]:
+        """Return which cells are within reach, and how the ways to their rows and cols read patches [B, N, M, C].
+
+        Returns:
+            The rows and cols of these cells, and weights [R, L, N] and [S, L, M].
+        """
+        assert self.size is not None, "path channels need the size of the window"
+        reached, hand = self.size.reached, (self.size.beside, self.size.behind)
+        rows, cols = (jnp.asarray(way_weights(*line)) for line in zip(x.shape[1:3], hand, reached, strict=True))
+        return reached, (rows, cols)
 
     def _along(self, x: jax.Array, rows: jax.Array, cols: jax.Array) -> jax.Array:
         """Return what the ways of pushes add, [B, R, S, K], that weights [B | 1, R, L, N] and [B | 1, S, L, M] read."""
@@ -227,21 +246,22 @@ class CompactNetwork(nn.Module):
         parts = Conv(looks * self.path_channels, 1, init, float32, name=PATH)(x)
         parts = parts.reshape(*x.shape[:3], looks, self.path_channels)
         rows, cols = (jnp.broadcast_to(w, (len(x), *w.shape[1:])) for w in (rows, cols))
-        parts = jnp.einsum("brln,bnmlf->brmlf", rows, parts, precision="highest")
-        found = jnp.einsum("bslm,brmlf->brsf", cols, parts, precision="highest")
+        parts = jnp.einsum("bslm,bnmlf->blnsf", cols, parts, precision="highest")
+        found = jnp.einsum("brln,blnsf->brsf", rows, parts, precision="highest")
         # Zero at first: it may join a network that has learnt without it.
         return Conv(self.num_choices, 1, nn.initializers.zeros, float32, name=PATH_READOUT)(nn.relu(found))
 
 
-def way_weights(num_patches: int, hand: int) -> np.ndarray:
-    """Return the weights [4 N, L, N] by which the way from cell `hand` of a line to each of its cells reads N patches.
+def way_weights(num_patches: int, hand: int, reached: slice) -> np.ndarray:
+    """Return the weights [R, L, N] by which the ways from cell `hand` of a line to R `reached` ones read N patches.
 
     At each of `LOOKS` two patches are read, in the proportions in which `upsample` interpolates between them; ways that
     leave the window end at its border.
     """
-    cells = np.arange(PATCH * num_patches)
-    seen = np.clip(hand + np.array(LOOKS) * (cells[:, None] - hand), 0, cells[-1])
-    return interpolation_weights(upsample_positions(seen, num_patches, len(cells)), num_patches).astype(np.float32)
+    num_cells = PATCH * num_patches
+    cells = np.arange(num_cells)[reached]
+    seen = np.clip(hand + np.array(LOOKS) * (cells[:, None] - hand), 0, num_cells - 1)
+    return interpolation_weights(upsample_positions(seen, num_patches, num_cells), num_patches).astype(np.float32)
 
 
 def patches(x: jax.Array) -> jax.Array:
