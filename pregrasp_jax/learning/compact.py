@@ -199,7 +199,7 @@ class CompactNetwork(nn.Module):
             reached, ways = self._ways(x)
             places = [cell - box.start for cell, box in zip((row, col), reached, strict=True)]
             rows, cols = (way[place][:, None] for way, place in zip(ways, places, strict=True))
-            within = [(0 <= place) & (place < len(way)) for way, place in zip(ways, places, strict=True)]
+            within = [(place >= 0) & (place < len(way)) for way, place in zip(ways, places, strict=True)]
             taken += jnp.where((within[0] & within[1])[:, None], self._along(x, rows, cols)[:, 0, 0], 0.0)
         return jnp.where(inside[:, None], taken, 0.0)
 
