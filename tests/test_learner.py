@@ -242,7 +242,7 @@ def test_what_has_no_value_and_gets_none_is_left_out():
 
 def test_samples_of_a_kind_take_turns():
     batch = make_batch([0] * 5, [1] * 5, terminated=jnp.array([False, True, False, False, False]))
-    chosen = [learner.to_value(batch, 2, jnp.int32(turn)).tolist() for turn in range(5)]
+    chosen = [np.arange(5)[learner.to_value(batch, 2, jnp.int32(turn))].tolist() for turn in range(5)]
     assert chosen == [[0, 2], [2, 3], [2, 3], [3, 4], [4, 0]]
 
 

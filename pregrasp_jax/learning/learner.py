@@ -153,8 +153,8 @@ def update(
     return next_state, errors, values, _metrics(batch, loss, errors, targets, known, grads, successes)
 
 
-def to_value(batch: Batch, count: int, turn: jax.Array) -> jax.Array:
-    """Return which `count` of B samples get their next state valued, [count] int32.
+def to_value(batch: Batch, count: int, turn: jax.Array) -> jax.Array | slice:
+    """Return which `count` of B samples get their next state valued, [count] int32, or a slice of all.
 
     First those whose next state has no value yet, then those that have one, last those that ended and need none; of a
     kind by turns, since samples are in the order of their rows.
@@ -166,7 +166,7 @@ def to_value(batch: Batch, count: int, turn: jax.Array) -> jax.Array:
     """
     size = len(batch.drawn)
     if count == size:
-        return jnp.arange(size)
+        return slice(None)  # devices that share a batch keep their parts
     ended = jnp.any(batch.drawn & batch.terminated, axis=1)
     valued = jnp.any(batch.drawn & (batch.next_values > UNKNOWN), axis=1)
     rank = jnp.where(ended, 2, jnp.where(valued, 1, 0))
