@@ -92,7 +92,7 @@ def test_patches_hold_their_own_pixels():
 
 
 def make_network(path=0):
-    network = CompactNetwork(channels=4, blocks=2, path_channels=path, size=SIZE, initial_bias=0.3)
+    network = CompactNetwork(SIZE, channels=4, blocks=2, path_channels=path, initial_bias=0.3)
     images = jax.random.uniform(jax.random.key(1), (3, *SIZE.shape, 3))
     window = Window(images, jnp.array([[-10, -20], [20, 60], [3, 4]]))
     params = drawn_params(network.init, window)
@@ -104,26 +104,30 @@ def test_value_of_an_action_is_its_pixel_of_the_grid_and_zero_outside_the_window
     network, params, window = make_network(path)
     whole = np.asarray(jax.jit(network.apply)(params, window))
     assert whole.shape == (3, 100, 100, 2) and np.ptp(whole) > 0.1
-    actions = [
-        ACTIONS.encode(np.int32(r), np.int32(c), np.int32(a)) for r, c, a in ((9, 30, 1), (99, 99, 0), (80, 3, 1))
-    ]
     q = QFunction(network, ACTIONS, functools.partial(look_around_hand, size=SIZE))
-    taken = np.asarray(jax.jit(q.at)(params["params"], window, np.stack(actions)))
-    np.testing.assert_allclose(taken[:2], [whole[0, 9, 30, 1], whole[1, 99, 99, 0]], rtol=1e-5)
-    assert taken[2] == whole[2, 80, 3, 1] == 0.0  # left of its window
-    assert whole[2, 80, 4, 1] != 0.0
+    cells = np.stack(np.meshgrid(range(0, 100, 3), range(0, 100, 3), indexing="ij"), axis=-1).reshape(-1, 2)
+    actions = np.repeat(ACTIONS.encode(cells[:, 0], cells[:, 1], np.arange(len(cells)) % 2)[:, None], 3, axis=1)
+    taken = jax.jit(jax.vmap(q.at, (None, None, 0)))(params["params"], window, actions.astype(np.int32))
+    expected = whole.reshape(3, -1)[:, actions[:, 0]].T
+    np.testing.assert_allclose(taken, expected, rtol=1e-4, atol=1e-6)
+    assert 0.1 < np.mean(expected == 0.0) < 0.9, "some are outside of their window"
+    assert whole[2, 80, 3, 1] == 0.0 != whole[2, 80, 4, 1]  # the window begins at column 4
 
 
-def test_ways_from_the_hand_are_read_between_the_middles_of_patches():
-    """A line of 6 patches, the hand in cell 8: patches that hold their position are read where the looks are."""
-    weights = way_weights(6, 8, slice(2, 24))
-    assert weights.shape == (22, 5, 6)
-    corner_on_corner = np.arange(6) * 23 / 5
-    for i, cell in enumerate(range(2, 24)):
-        seen = [min(max(8 + share * (cell - 8), 0.0), 23.0) for share in (0.25, 0.5, 0.75, 1.0, 1.3)]
-        np.testing.assert_allclose(weights[i] @ corner_on_corner, seen, atol=1e-4)
-        assert np.count_nonzero(weights[i], axis=1).max() <= 2
-    np.testing.assert_allclose(weights.sum(axis=2), 1.0, atol=1e-6)
+@pytest.mark.parametrize("full_ring", [False, True])
+def test_ways_from_the_hand_are_read_between_the_middles_of_patches(full_ring):
+    """Patches that hold their own position are read where the looks are."""
+    size = window_size(TaskConfig(full_ring=full_ring))
+    for weights, hand, reached in zip(way_weights(size), (size.beside, size.behind), size.reached, strict=True):
+        cells, num_patches = range(reached.start, reached.stop), weights.shape[2]
+        assert weights.shape == (len(cells), 5, num_patches)
+        last = 4 * num_patches - 1
+        corner_on_corner = np.arange(num_patches) * last / (num_patches - 1)
+        for i, cell in enumerate(cells):
+            seen = [min(max(hand + share * (cell - hand), 0.0), last) for share in (0.25, 0.5, 0.75, 1.0, 1.3)]
+            np.testing.assert_allclose(weights[i] @ corner_on_corner, seen, atol=1e-3)
+            assert np.count_nonzero(weights[i], axis=1).max() <= 2
+        np.testing.assert_allclose(weights.sum(axis=2), 1.0, atol=1e-5)
 
 
 class Features(CompactNetwork):
@@ -138,10 +142,10 @@ def test_the_second_readout_adds_what_lies_on_the_way():
     """By hand, in loops: for one push, every look reads its point between four patches."""
     network, params, window = make_network(3)
     layers = params["params"]
-    plain = CompactNetwork(channels=4, blocks=2, initial_bias=0.3)
+    plain = CompactNetwork(SIZE, channels=4, blocks=2, initial_bias=0.3)
     first = {name: layer for name, layer in layers.items() if "path" not in name}
     gain = np.asarray(jax.jit(network.apply)(params, window) - jax.jit(plain.apply)({"params": first}, window))
-    features = np.asarray(Features(channels=4, blocks=2).apply(params, window))
+    features = np.asarray(Features(SIZE, channels=4, blocks=2).apply(params, window))
     kernel, bias = np.asarray(layers["path"]["kernel"])[0, 0], np.asarray(layers["path"]["bias"])
     for scene, row, col in ((0, 30, 40), (2, 71, 21), (2, 12, 56)):
         height, width = features.shape[1:3]

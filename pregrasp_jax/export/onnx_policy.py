@@ -135,8 +135,7 @@ def _compact_features(graph: Graph, x: str, params: Params) -> str:
 
 def _read_ways(graph: Graph, parts: str, channels: int, size: WindowSize) -> str:
     """Read patches [batch, L F, N, M] along the ways of pushes within reach: [batch, F, R, S]; `_along`."""
-    lines = zip(size.shape, (size.beside, size.behind), size.reached, strict=True)
-    rows, cols = (way_weights(cells // PATCH, hand, reached) for cells, hand, reached in lines)
+    rows, cols = way_weights(size)
     looks, height, width = len(LOOKS), rows.shape[2], cols.shape[2]
     parts = graph("Reshape", parts, np.array([0, looks, channels, height, width]))
     rows, cols = rows.transpose(1, 0, 2)[:, None], cols.transpose(1, 2, 0)[:, None]

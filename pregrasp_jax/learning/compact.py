@@ -13,7 +13,7 @@ It is told where every patch lies, in the window and on the table: the edges ove
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import flax.struct as struct
@@ -153,19 +153,19 @@ class CompactNetwork(nn.Module):
     """Q-values of the pushes inside a window around the hand.
 
     Attributes:
+        size: of the window, where the hand is in it and what is within its reach.
         num_choices: K, values per cell.
         channels: of every layer.
         blocks: residual blocks.
         path_channels: F, channels that are read along the way of every push before they become its value; 0 for none.
-        size: of the window, where pushes are within reach; needed by path channels only.
         initial_bias: Q-value of every push before training.
     """
 
+    size: WindowSize
     num_choices: int = 2
     channels: int = 32
     blocks: int = 5
     path_channels: int = 0
-    size: WindowSize | None = None
     initial_bias: float = 0.0
 
     @nn.compact
@@ -181,8 +181,8 @@ class CompactNetwork(nn.Module):
         x = self._features(window)
         q = self._interpolated(x)
         if self.path_channels:
-            reached, (rows, cols) = self._ways(x)
-            q = q.at[:, *reached].add(self._along(x, rows[None], cols[None]))
+            rows, cols = way_weights(self.size)
+            q = q.at[:, *self.size.reached].add(self._along(x, rows[None], cols[None]))
         return jax.vmap(paste)(q, window.origin)
 
     @nn.compact
@@ -196,11 +196,11 @@ class CompactNetwork(nn.Module):
         row, col = jnp.clip(row, 0, height - 1), jnp.clip(col, 0, width - 1)
         taken = q[jnp.arange(len(row)), row, col]
         if self.path_channels:
-            reached, ways = self._ways(x)
-            places = [cell - box.start for cell, box in zip((row, col), reached, strict=True)]
-            rows, cols = (way[place][:, None] for way, place in zip(ways, places, strict=True))
-            within = [(place >= 0) & (place < len(way)) for way, place in zip(ways, places, strict=True)]
-            taken += jnp.where((within[0] & within[1])[:, None], self._along(x, rows, cols)[:, 0, 0], 0.0)
+            rows, cols = map(jnp.asarray, way_weights(self.size))
+            row, col = (cell - box.start for cell, box in zip((row, col), self.size.reached, strict=True))
+            within = (row >= 0) & (row < len(rows)) & (col >= 0) & (col < len(cols))
+            along = self._along(x, rows[row][:, None], cols[col][:, None])[:, 0, 0]
+            taken += jnp.where(within[:, None], along, 0.0)
         return jnp.where(inside[:, None], taken, 0.0)
 
     def _features(self, window: Window) -> jax.Array:
@@ -227,18 +227,7 @@ class CompactNetwork(nn.Module):
             q = upsample(q)
         return q
 
-    def _ways(self, x: jax.Array) -> tuple[tuple[slice, slice], tuple[jax.Array, jax.Array]]:
-        """Return which cells are within reach, and how the ways to their rows and cols read patches [B, N, M, C].
-
-        Returns:
-            The rows and cols of these cells, and weights [R, L, N] and [S, L, M].
-        """
-        assert self.size is not None, "path channels need the size of the window"
-        reached, hand = self.size.reached, (self.size.beside, self.size.behind)
-        rows, cols = (jnp.asarray(way_weights(*line)) for line in zip(x.shape[1:3], hand, reached, strict=True))
-        return reached, (rows, cols)
-
-    def _along(self, x: jax.Array, rows: jax.Array, cols: jax.Array) -> jax.Array:
+    def _along(self, x: jax.Array, rows: Any, cols: Any) -> jax.Array:
         """Return what the ways of pushes add, [B, R, S, K], that weights [B | 1, R, L, N] and [B | 1, S, L, M] read."""
         float32, looks = jnp.dtype(jnp.float32), len(LOOKS)
         # The parts of all looks are added before they become values.
@@ -252,16 +241,24 @@ class CompactNetwork(nn.Module):
         return Conv(self.num_choices, 1, nn.initializers.zeros, float32, name=PATH_READOUT)(nn.relu(found))
 
 
-def way_weights(num_patches: int, hand: int, reached: slice) -> np.ndarray:
-    """Return the weights [R, L, N] by which the ways from cell `hand` of a line to R `reached` ones read N patches.
+def way_weights(size: WindowSize) -> tuple[np.ndarray, np.ndarray]:
+    """Return by which weights the ways from the hand to the cells within reach read the patches of a window.
 
-    At each of `LOOKS` two patches are read, in the proportions in which `upsample` interpolates between them; ways that
-    leave the window end at its border.
+    At each of L `LOOKS` two patches of a line are read, in the proportions in which `upsample` interpolates between
+    them; ways that leave the window end at its border.
+
+    Returns:
+        [R, L, N] for R rows and N rows of patches, and [S, L, M] for S cols.
     """
-    num_cells = PATCH * num_patches
-    cells = np.arange(num_cells)[reached]
-    seen = np.clip(hand + np.array(LOOKS) * (cells[:, None] - hand), 0, num_cells - 1)
-    return interpolation_weights(upsample_positions(seen, num_patches, num_cells), num_patches).astype(np.float32)
+
+    def of_line(num_cells: int, hand: int, reached: slice) -> np.ndarray:
+        num_patches = num_cells // PATCH
+        last = PATCH * num_patches - 1
+        seen = np.clip(hand + np.array(LOOKS) * (np.arange(num_cells)[reached, None] - hand), 0, last)
+        return interpolation_weights(upsample_positions(seen, num_patches, last + 1), num_patches).astype(np.float32)
+
+    (num_rows, num_cols), (rows, cols) = size.shape, size.reached
+    return of_line(num_rows, size.beside, rows), of_line(num_cols, size.behind, cols)
 
 
 def patches(x: jax.Array) -> jax.Array:

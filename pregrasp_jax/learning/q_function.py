@@ -121,7 +121,7 @@ def make_q_function(network: NetworkConfig, task: TaskConfig, actions: ActionSpa
         return QFunction(paper, actions, network_input, mirror_fn, members=network.num_members)
     channels, size = max(1, round(_COMPACT_CHANNELS * network.width)), window_size(task)
     return QFunction(
-        CompactNetwork(channels=channels, path_channels=network.num_path_channels, size=size, **common),
+        CompactNetwork(size, channels=channels, path_channels=network.num_path_channels, **common),
         actions,
         functools.partial(look_around_hand, size=size),
         mirror_window if network.mirror else None,
