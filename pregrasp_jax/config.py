@@ -39,7 +39,7 @@ class AssetsConfig:
     """Training uses `seen`; `unseen` holds objects kept for evaluation (Sec. IV-A)."""
     variants: int = 0
     """Objects made beside those of the set: scaled, drawn from families, cut and joined. Training meets them with the
-    set's own; validation and `evaluate` meet only others that were made in the same way. See docs/learning.md."""
+    set's own; validation and `evaluate` meet only others that were made in the same way. See docs/unseen.md."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +177,7 @@ class LearnerConfig:
     """Q-learning (Sec. III-E)."""
 
     optimizer: Literal["adam", "muon"] = "adam"
-    """Adam as in the paper, or Muon for the kernels before the readout (docs/learning.md)."""
+    """Adam as in the paper, or Muon for the kernels before the readout (docs/unseen.md)."""
     learning_rate: float = 1e-4
     """Step size of the optimizer."""
     final_learning_rate: float = 1e-4
