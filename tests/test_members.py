@@ -145,6 +145,14 @@ def test_values_that_mean_something_else_are_not_averaged(change, any_values, tm
     assert not (tmp_path / "out").exists()
 
 
+def test_no_path_channels_and_none_said_are_one_network(tmp_path):
+    said = changed(CONFIG, {"network.path_channels": 0})
+    for name, config in (("first", CONFIG), ("other", said)):
+        save_random(tmp_path / name, config)
+    main(["combine", str(tmp_path / "first"), str(tmp_path / "other"), "--out", str(tmp_path / "out")])
+    assert load_policy(tmp_path / "out").config == of(CONFIG, 2)
+
+
 @pytest.mark.parametrize("change", REWARDS)
 def test_what_is_to_be_trained_on_may_have_had_other_rewards(change, tmp_path):
     save_random(tmp_path / "first", CONFIG)

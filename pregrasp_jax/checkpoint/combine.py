@@ -70,8 +70,10 @@ def _meaning(path: Path | str, policy: TrainedPolicy) -> dict[str, Any]:
     """Return, by name, the settings that decide what a value means, and of what network it is."""
     if policy.config.train.method != "q_learning":
         raise ValueError(f"{path} has learnt by {policy.config.train.method}; allowed are policies of Q-learning")
+    network = dataclasses.replace(policy.config.network, path_channels=policy.config.network.num_path_channels)
+    settings = flatten(to_dict(dataclasses.replace(policy.config, network=network)))
     return {
         name: value
-        for name, value in flatten(to_dict(policy.config)).items()
+        for name, value in settings.items()
         if name in _REWARDS or (name.startswith(("network.", "task.")) and name not in _FREE)
     }
