@@ -107,10 +107,19 @@ class EvaluationConfig:
             raise ValueError(
                 "reachable = True: plan = True takes no push that is out of reach; allowed is one of the two"
             )
-        if not self.plan and self.planning != PlanningConfig():
-            raise ValueError("planning.* is set, but plan = False; allowed is plan = True with it")
-        self.planning.validate()
+        refuse_planning(self.plan, self.planning)
         return self
+
+
+def refuse_planning(plan: bool, planning: PlanningConfig) -> None:
+    """Refuse settings of a search that is not asked for, or out of range.
+
+    Raises:
+        ValueError: one line says which.
+    """
+    if not plan and planning != PlanningConfig():
+        raise ValueError("planning.* is set, but plan = False; allowed is plan = True with it")
+    planning.validate()
 
 
 _PLANNING_RANGES: dict[str, tuple[float, float]] = {

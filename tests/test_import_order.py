@@ -27,7 +27,7 @@ ORDER = [
     ["checkpoint"],
     ["planning"],
     ["evaluation", "gymnasium"],
-    ["export", "simulated_cell"],
+    ["export", "planned_cell", "simulated_cell"],
     ["training"],
     ["report"],
     ["sweep"],

@@ -149,7 +149,7 @@ def test_scripts_join_one_proposal_and_compiling_takes_none_of_the_first_decisio
     vars(stub).update(
         {
             "_config": PlanningConfig(candidates=1, budget_ms=50),
-            "_promise": promise_of(TaskConfig()),
+            "_promise": promise_of(TaskConfig(), 0.7),
             "_rollout": scripted,
         },
         **{"_max_pushes": 10, "_camera": None, "_seconds": [], "_pushes": [], "_rebuild": lambda *_: (None, None)},
@@ -172,8 +172,10 @@ def test_hidden_state_cannot_leak():
     env = make_env(config, split="test", threads=1)
     q_function = make_q_function(config.network, policy.config.task, env.primitive.actions)
     blind = dataclasses.replace(env, bank=None, scenes=None, engine=None, eligible=None)
-    promise = promise_of(policy.config.task)
-    planner = Planner(blind, q_function, policy.params, PlanningConfig(depth=0, variants=1), promise=promise, threads=1)
+    promise = promise_of(policy.config.task, policy.config.learner.discount)
+    planner = Planner(
+        blind, q_function, policy.params, PlanningConfig(depth=0, variants=1), promise=promise, camera_m=None, threads=1
+    )
     states = jax.device_get(jax.jit(jax.vmap(env.reset_to))(jnp.arange(2)))
     rng = np.random.default_rng(0)
     ids, poses = states.scene.object_ids, states.physics_obs.object_poses

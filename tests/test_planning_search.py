@@ -18,7 +18,7 @@ from pregrasp_jax.planning.rollout import Rollout
 from pregrasp_jax.planning.search import search
 from pregrasp_jax.types import REASONS
 
-PROMISE = promise_of(TaskConfig())
+PROMISE = promise_of(TaskConfig(), 0.5)
 
 
 class World:
@@ -149,17 +149,33 @@ def test_without_time_one_round_decides():
 
 
 @pytest.mark.parametrize("approach", [0.5, 0.0])
-def test_chances_rise_with_values_and_are_in_rewards_of_a_success(approach: float):
-    found = promise_of(TaskConfig(approach_reward=approach))(np.linspace(-1, 3, 50))
-    assert (np.diff(found) >= 0).all() and 0 < found[0] < 0.1 and 0.9 < found[-1] < 1
-    tripled = promise_of(TaskConfig(approach_reward=approach, in_region_reward=6.0))(3 * np.linspace(-1, 3, 50))
+@pytest.mark.parametrize("discount", [0.5, 0.7, 0.85, 0.99])
+def test_chances_rise_with_values_and_are_in_rewards_of_a_success(approach: float, discount: float):
+    found = promise_of(TaskConfig(approach_reward=approach), discount)(np.linspace(-1, 3, 50))
+    assert (np.diff(found) >= 0).all() and 0 <= found[0] < 0.1 and 0.9 < found[-1] < 1
+    tripled = promise_of(TaskConfig(approach_reward=approach, in_region_reward=6.0), discount)(
+        3 * np.linspace(-1, 3, 50)
+    )
     np.testing.assert_allclose(tripled, found)
 
 
 def test_a_value_promises_more_where_coming_nearer_does_not_count():
     values = np.array([0.6, 0.9, 1.2])
-    counting, alone = (promise_of(TaskConfig(approach_reward=reward))(values) for reward in (0.5, 0.0))
+    counting, alone = (promise_of(TaskConfig(approach_reward=reward), 0.7)(values) for reward in (0.5, 0.0))
     assert (alone > counting + 0.05).all()
+
+
+def test_a_value_promises_less_the_more_a_later_success_is_worth():
+    values = np.linspace(0, 2.5, 200)
+    by_discount = [promise_of(TaskConfig(approach_reward=0.0), discount)(values) for discount in (0.7, 0.8, 0.9, 0.95)]
+    assert (np.diff(by_discount, axis=0) <= 0.01).all()
+    assert by_discount[0][80] > by_discount[1][80] + 0.05 > by_discount[3][80] + 0.1
+    for discount, like in ((0.5, 0.7), (1.0, 0.95)):
+        np.testing.assert_array_equal(
+            *(promise_of(TaskConfig(approach_reward=0.0), d)(values) for d in (discount, like))
+        )
+    halfway = promise_of(TaskConfig(approach_reward=0.0), 0.825)(values)
+    np.testing.assert_allclose(halfway, (by_discount[0] + by_discount[3]) / 2)
 
 
 @pytest.mark.parametrize("count", [1, 3, 5])

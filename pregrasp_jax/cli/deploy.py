@@ -1,11 +1,16 @@
 """`pregrasp-jax deploy` and `calibrate-check`: a bundle on a robot, or on something that stands for one."""
 
+import dataclasses
 from pathlib import Path
 from typing import Literal
 
 from pregrasp_jax import io
-from pregrasp_jax.deploy.bundle import read_bundle
+from pregrasp_jax.deploy.bundle import Bundle, read_bundle
 from pregrasp_jax.deploy.cell import Cell, read_cell
+from pregrasp_jax.deploy.loop import Station
+from pregrasp_jax.evaluation_config import PlanningConfig, refuse_planning
+
+_PLANNING = PlanningConfig()
 
 
 def deploy(
@@ -16,6 +21,8 @@ def deploy(
     arm: Literal["dry", "sim", "ur"] = "dry",
     gripper: Literal["dry", "sim", "modbus"] | None = None,
     once: bool = False,
+    plan: bool = False,
+    planning: PlanningConfig = _PLANNING,
     log: Path | None = None,
     replay: Path | None = None,
 ) -> None:
@@ -27,6 +34,8 @@ def deploy(
         arm: `dry` says what it would send; `sim` simulates the whole cell; `ur` moves a UR arm (extra `robot`).
         gripper: `dry`, `sim`, or `modbus`, an OnRobot RG2 (extra `robot`); by default dry, or sim with sim.
         once: Decide and push once only.
+        plan: Search in a rebuilt scene before every push; needs JAX and MuJoCo (docs/planning.md).
+        planning: How much is searched.
         log: New folder for every decision with all that it followed from.
         replay: Draw the decisions of such a folder and do nothing else.
     """
@@ -43,6 +52,7 @@ def deploy(
         raise ValueError(f"--config is missing; allowed with --arm {arm} is a cell.yaml (docs/robot.md)")
     cell, folder = (Cell(), Path()) if config is None else (read_cell(config), config.parent)
     hand = gripper or ("sim" if arm == "sim" else "dry")
+    refuse_planning(plan, planning)
     held = read_bundle(bundle)
     if arm == "sim" and hand == "sim":
         import pregrasp_jax.simulated_cell as simulated  # with JAX and MuJoCo
@@ -53,10 +63,23 @@ def deploy(
     else:
         raise ValueError(f"--arm {arm} with --gripper {hand}: a simulated cell has both; allowed is sim with sim")
     try:
+        if plan:
+            station = _with_search(station, held, planning)
         station.run(once=once)
     finally:
         station.arm.close()
         station.gripper.close()
+
+
+def _with_search(station: Station, bundle: Bundle, planning: PlanningConfig) -> Station:
+    """Return a station that searches before every push."""
+    try:
+        from pregrasp_jax.planned_cell import make_search
+    except ImportError as error:
+        raise ValueError(f"plan = True: {error.name} is not installed; allowed is pip install pregrasp_jax") from None
+    camera_m = station.view.camera.world_from_optical[:3, 3]
+    search = make_search(bundle, planning, start=station.decider.start(), camera_m=camera_m, say=station.say)
+    return dataclasses.replace(station, search=search)
 
 
 def calibrate_check(config: Path, /, *, bundle: Path, depth: Path, png: Path = Path("calibration.png")) -> int:

@@ -62,6 +62,7 @@ class Decision(NamedTuple):
         coverage: share of the target's cells in the closing region.
         push: None if the hand should close, or if no push is left.
         refused: (action, what is in the way) of better pushes that the arm cannot make.
+        searched: the action that a search has chosen, None without one.
         q: [H, W, K] values; None if the hand should close.
         allowed: [H, W, K] bool.
     """
@@ -72,6 +73,7 @@ class Decision(NamedTuple):
     refused: tuple[tuple[int, str], ...]
     q: np.ndarray | None
     allowed: np.ndarray
+    searched: int | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -102,6 +104,7 @@ class Decider:
         hand: motion.Held,
         joint_pos: np.ndarray,
         *,
+        search: Callable[[], int] | None = None,
         lap: Callable[[str], None] = lambda _: None,
     ) -> Decision:
         """Return what to do next.
@@ -110,6 +113,7 @@ class Decider:
             maps: what is seen.
             hand: commanded end of the last push; `start` before the first.
             joint_pos: [J] rad, measured.
+            search: asked for a push unless it is time to close; if the arm cannot make that one, the network counts.
             lap: told when a part of the work is done.
 
         Raises:
@@ -133,8 +137,12 @@ class Decider:
         lap("region")
         q = self.values(maps.height_m[None], maps.labels[None], p1[None])[0]
         lap("network")
-        push, refused = self._best(q, allowed, hand, joint_pos)
-        return Decision(False, coverage, push, refused, q, allowed)
+        searched = None
+        if search is not None:
+            searched = search()
+            lap("search")
+        push, refused = self._best(q, allowed, hand, joint_pos, first=searched)
+        return Decision(False, coverage, push, refused, q, allowed, searched)
 
     def coverage(self, maps: Maps, joint_pos: np.ndarray) -> float:
         """Return the share of the target's cells that lie in the closing region of the hand where it is now."""
@@ -169,15 +177,18 @@ class Decider:
         return push, _obstruction(found)
 
     def _best(
-        self, q: np.ndarray, allowed: np.ndarray, hand: motion.Held, joint_pos: np.ndarray
+        self, q: np.ndarray, allowed: np.ndarray, hand: motion.Held, joint_pos: np.ndarray, *, first: int | None = None
     ) -> tuple[Push | None, tuple[tuple[int, str], ...]]:
-        """Return the best push that the arm can make, and the better ones that it cannot.
+        """Return the best push that the arm can make, `first` before all others, and the better ones that it cannot.
 
         Those near to a refused one are left out, as in `policies.learned.best_reachable`.
         """
         space, left, refused = action_space(self.contract.action), allowed & np.isfinite(q), []
+        order = np.where(left, q, -np.inf)
+        if first is not None:
+            order.flat[first] = np.inf
         while left.any():
-            action = int(np.argmax(np.where(left, q, -np.inf)))
+            action = int(np.argmax(np.where(left, order, -np.inf)))
             push, obstruction = self.plan(action, float(q.flat[action]), hand, joint_pos)
             if not obstruction:
                 return push, tuple(refused)

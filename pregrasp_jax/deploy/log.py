@@ -78,6 +78,7 @@ class DecisionLog:
                 "end_base": [float(x) for x in push.base_pose],
                 "seconds": push.seconds,
             },
+            "searched": decision.searched,
             "refused": [[action, reason] for action, reason in decision.refused[:20]],
             "times_ms": {key: round(value, 3) for key, value in times_ms.items()},
             "policy": self._contract.training.parameters_hash,

@@ -1,5 +1,6 @@
 """Look, decide, push, look again; close when the target is enclosed."""
 
+import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from pregrasp_jax.deploy.devices import ArmDriver, Frame, GripperDriver, ImageSo
 from pregrasp_jax.deploy.log import DecisionLog
 from pregrasp_jax.deploy.masks import Target, fuse
 from pregrasp_jax.deploy.projection import Maps, draw_robot, to_maps
+from pregrasp_jax.deploy.search import ROBOT, Search, Seen, instance_image
 from pregrasp_jax.deploy.view import View
 from pregrasp_jax.sensors import PointOfCell
 from pregrasp_jax.spaces import motion
@@ -65,6 +67,7 @@ class Station:
         gripper: that is held open or closed meanwhile.
         depth_scale: m per step of an image; None as in `depth_in_metres`.
         cell: which of the points above a cell counts.
+        search: that chooses pushes; None leaves it to the network.
         log: None writes nothing.
         say: told what happens.
     """
@@ -78,6 +81,7 @@ class Station:
     gripper: GripperDriver
     depth_scale: float | None = None
     cell: PointOfCell = "max"
+    search: Search | None = None
     log: DecisionLog | None = None
     say: Callable[[str], None] = print
 
@@ -91,7 +95,7 @@ class Station:
         entry = self.decider.contract.action
         hand, pushes = self.decider.start(), 0
         while True:
-            looked = self.look(hand)
+            looked = self.look(hand, pushes=pushes)
             self._write(pushes, looked, hand)
             decision = looked.decision
             if decision.close:
@@ -115,8 +119,13 @@ class Station:
             if once:
                 return self._end("once", pushes)
 
-    def look(self, hand: motion.Held) -> Looked:
-        """Take an image and decide; `hand` is where the last push was commanded to end."""
+    def look(self, hand: motion.Held, *, pushes: int = 0) -> Looked:
+        """Take an image and decide.
+
+        Args:
+            hand: where the last push was commanded to end.
+            pushes: made in this trial.
+        """
         frame = self._capture()
         clock = _Clock()
         masks = self.segmenter.segment(frame)
@@ -132,7 +141,14 @@ class Station:
         clock.lap("drawing")
         maps = to_maps(depth, cut, view=self.view, cell=self.cell)
         clock.lap("projection")
-        decision = self.decider.decide(maps, hand, joints, lap=clock.lap)
+        choose = None
+        if self.search is not None:
+            instances = self.view.cut(instance_image(masks, self.view.camera.shape))
+            on_grid = self._instances(depth, cut, instances, target=target + 1, maps=maps)
+            choose = functools.partial(
+                self.search.choose, Seen(maps.height_m, on_grid, target + 1, hand, joints, pushes)
+            )
+        decision = self.decider.decide(maps, hand, joints, search=choose, lap=clock.lap)
         clock.lap("decoding")
         return Looked(frame, labels, maps, decision, clock.times_ms)
 
@@ -142,6 +158,15 @@ class Station:
         apertures = [choice.aperture_rad for choice in entry.choices]
         fingers = min(apertures) + self.gripper.opening() * (max(apertures) - min(apertures))
         return Frame(depth, color, np.concatenate([self.arm.joints(), [fingers, fingers]]), taken)
+
+    def _instances(
+        self, depth: np.ndarray, labels: np.ndarray, instances: np.ndarray, *, target: int, maps: Maps
+    ) -> np.ndarray:
+        """Return the instances [H, W] of a cut image, which show robot and target where `labels` and `maps` do."""
+        entry = self.decider.contract.grid.labels
+        drawn = np.where(labels == entry["robot"], np.uint8(ROBOT), instances)
+        on_grid = to_maps(depth, drawn, view=self.view, cell=self.cell).labels
+        return np.where(maps.labels == entry["target"], np.uint8(target), on_grid)
 
     def _write(self, number: int, looked: Looked, hand: motion.Held) -> None:
         if self.log is not None:

@@ -4,13 +4,14 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from pregrasp_jax.checkpoint import TrainedPolicy
 from pregrasp_jax.evaluation_config import EvaluationConfig
+from pregrasp_jax.heightmap import overhead_camera
 from pregrasp_jax.learning.imitation import StrokeFunction
 from pregrasp_jax.learning.q_function import make_q_function
-from pregrasp_jax.planning.planner import Planner
-from pregrasp_jax.planning.promise import promise_of
+from pregrasp_jax.planning.planner import Planner, make_planner
 from pregrasp_jax.policies.learned import make_learned
 from pregrasp_jax.policies.ppg import greedy, make_ppg, make_target_ppg
 from pregrasp_jax.policies.scripts import Policy
@@ -37,10 +38,8 @@ def _play_q(env: Env, trained: TrainedPolicy, style: str, request: EvaluationCon
     # Of the task that it was trained on: a window of another size is another input.
     q_function = make_q_function(trained.config.network, trained.config.task, env.primitive.actions)
     if request.plan:
-        promise = promise_of(trained.config.task)
-        policy = Planner(
-            env, q_function, trained.params, request.planning, promise=promise, threads=request.physics.threads
-        )
+        camera_m = None if env.task.camera == "orthographic" else np.asarray(overhead_camera().position)
+        policy = make_planner(env, trained, request.planning, camera_m=camera_m, threads=request.physics.threads)
     else:
         policy = make_learned(env, q_function.values, reachable=request.reachable)(trained.params)
     return Learned(

@@ -8,17 +8,19 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from pregrasp_jax.checkpoint import TrainedPolicy
 from pregrasp_jax.evaluation_config import PlanningConfig
-from pregrasp_jax.heightmap import overhead_camera, robot_hulls
-from pregrasp_jax.learning.q_function import QFunction
+from pregrasp_jax.heightmap import robot_hulls
+from pregrasp_jax.learning.q_function import QFunction, make_q_function
 from pregrasp_jax.planning import memory as remembering
 from pregrasp_jax.planning import simulation
 from pregrasp_jax.planning.memory import Memory, Sight
-from pregrasp_jax.planning.promise import Promise
+from pregrasp_jax.planning.promise import Promise, promise_of
 from pregrasp_jax.planning.rebuild import draw_variants, hidden_cells
 from pregrasp_jax.planning.rollout import Rollout
 from pregrasp_jax.planning.search import search
 from pregrasp_jax.settings import to_dict
+from pregrasp_jax.task.assembly import with_task
 from pregrasp_jax.task.env import Env
 from pregrasp_jax.types import MAX_OBJECTS, EnvState, HullBank
 
@@ -55,16 +57,19 @@ class Planner:
         config: PlanningConfig,
         *,
         promise: Promise,
+        camera_m: np.ndarray | None,
         threads: int = 0,
     ):
         """Compile the model of rebuilt objects.
 
         Args:
-            env: of the task; its objects and scenes are not looked at.
+            env: of the task; its objects and scenes are not looked at. Rebuilt scenes are drawn as it sees them.
             q_function: of the policy that proposes and continues.
             params: of the policy.
             config: how much is searched.
-            promise: what the values of the policy mean, `promise.promise_of` the task that it was trained on.
+            promise: what the values of the policy mean, from `promise.promise_of`.
+            camera_m: [3], where the camera is that decisions are made by; None for one that looks straight down
+                everywhere.
             threads: of the simulations; 0 takes every core, and decisions do not depend on it.
         """
         self._config, self._promise = config, promise
@@ -74,7 +79,7 @@ class Planner:
         )
         self._rollout = Rollout(env, self._simulations, q_function, params, batch=BATCH)
         self._place_robot = jax.jit(functools.partial(robot_hulls, env.robot))
-        self._camera = None if env.task.camera == "orthographic" else np.asarray(overhead_camera().position)
+        self._camera = camera_m
         self._seconds: list[float] = []
         self._pushes: list[int] = []
 
@@ -130,6 +135,30 @@ class Planner:
         return variants.bank, self._rollout.start(
             variants.bank, object_ids, variants.poses, qpos, sight.obs.hand, sight.target
         )
+
+
+def make_planner(
+    env: Env, trained: TrainedPolicy, config: PlanningConfig, *, camera_m: np.ndarray | None, threads: int = 0
+) -> Planner:
+    """Return a search by a policy of Q-learning, in scenes that are drawn as in its training, by a clean sensor.
+
+    Args:
+        env: of the task; its objects and scenes are not looked at.
+        trained: who proposes and continues.
+        config: how much is searched.
+        camera_m: as in `Planner`.
+        threads: as in `Planner`.
+    """
+    task = trained.config.task
+    return Planner(
+        with_task(env, camera=task.camera, sensor="clean"),
+        make_q_function(trained.config.network, task, env.primitive.actions),
+        trained.params,
+        config,
+        promise=promise_of(task, trained.config.learner.discount),
+        camera_m=camera_m,
+        threads=threads,
+    )
 
 
 def spread_best(values: np.ndarray, count: int) -> list[int]:
