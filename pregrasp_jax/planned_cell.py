@@ -8,6 +8,7 @@ import numpy as np
 from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.config import Config, SceneConfig
 from pregrasp_jax.deploy.bundle import Bundle
+from pregrasp_jax.deploy.contract import SAFETENSORS
 from pregrasp_jax.deploy.search import ROBOT, TABLE, Seen
 from pregrasp_jax.evaluation_config import PlanningConfig
 from pregrasp_jax.machine import announced_compilation
@@ -65,6 +66,11 @@ def make_search(
     Raises:
         ValueError: the bundle lacks its parameters, or its policy does not push.
     """
+    if SAFETENSORS not in bundle.files:
+        raise ValueError(
+            f"plan = True: {bundle.folder} has no {SAFETENSORS}; allowed is a bundle exported with "
+            "--formats onnx safetensors"
+        )
     prepare()
     trained = load_policy(bundle.folder)
     if trained.config.train.method != "q_learning":

@@ -244,6 +244,15 @@ def test_settings_of_a_search_that_cannot_be_are_one_line(options: list[str], sa
     assert stopped.value.code == 2 and said in capsys.readouterr().err
 
 
+def test_a_bundle_without_parameters_cannot_be_searched_by():
+    files = {name: data for name, data in SMALL.bundle.files.items() if name != "policy.safetensors"}
+    bundle = dataclasses.replace(SMALL.bundle, files=files)
+    with pytest.raises(
+        ValueError, match=r"has no policy.safetensors; allowed is a bundle exported with --formats onnx sa"
+    ):
+        planned_cell.make_search(bundle, PlanningConfig(), start=small_decider().start(), camera_m=np.zeros(3))
+
+
 @pytest.mark.slow
 def test_a_simulated_cell_searches_before_it_pushes(capsys):
     bundle = SMALL.bundle
