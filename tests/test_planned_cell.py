@@ -14,13 +14,15 @@ from pregrasp_jax.cli.main import main
 from pregrasp_jax.deploy.cell import Cell
 from pregrasp_jax.deploy.loop import Station
 from pregrasp_jax.deploy.masks import Masks
+from pregrasp_jax.deploy.poses import on_table
 from pregrasp_jax.deploy.projection import Maps
 from pregrasp_jax.deploy.search import ROBOT, TABLE, Seen, instance_image
 from pregrasp_jax.evaluation_config import PlanningConfig
-from pregrasp_jax.planned_cell import CellSearch
+from pregrasp_jax.planned_cell import CellSearch, joints_as_trained
 from pregrasp_jax.planning.memory import NOTHING, Memory, Shape, Sight
 from pregrasp_jax.planning.planner import Planned
 from pregrasp_jax.planning.tracking import TARGET_SLOT, slots_of
+from pregrasp_jax.robot import kinematics
 from pregrasp_jax.simulated_cell import make_simulated_station
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.workspace import Box
@@ -140,7 +142,8 @@ class Recorder:
 
 def test_a_planner_is_told_what_is_seen_and_forgets_at_the_next_trial():
     planner: Any = Recorder()
-    search, decider = CellSearch(planner), small_decider()
+    decider = small_decider()
+    search = CellSearch(planner, cell=decider.body.arm, trained=decider.body.arm)
     instances = np.full((100, 100), TABLE, np.uint8)
     instances[block(20, 20)], instances[block(60, 40)], instances[block(0, 90)] = 7, 2, ROBOT
     height = np.where(instances == TABLE, 0, 0.1).astype(np.float32)
@@ -159,6 +162,25 @@ def test_a_planner_is_told_what_is_seen_and_forgets_at_the_next_trial():
         np.testing.assert_allclose(sight.joint_pos, joints, atol=1e-6)
         np.testing.assert_allclose(sight.obs.hand.xy, decider.start().xy, atol=1e-6)
     assert [sight.pushes for sight, _ in planner.told] == [0, 1, 0]
+
+
+@pytest.mark.parametrize("height_m", [0.0, 0.06, -0.04])
+def test_a_planner_is_told_joints_that_hold_the_hand_where_it_is(height_m: float):
+    body = on_table(small_decider().body, height_m)
+    trained, joints = small_decider().body.arm, np.array([*SMALL.golden["joint_pos"][1][:6], 0.3, 0.4], float)
+    joints[5] += 2 * np.pi  # the wrist turned once
+    found = joints_as_trained(joints, cell=body.arm, trained=trained)
+    wanted = kinematics.grasp_pose(body.arm, joints[:6])
+    np.testing.assert_allclose(kinematics.grasp_pose(trained, found[:6]), wanted, atol=1e-4)
+    np.testing.assert_array_equal(found[6:], [0.3, 0.4])
+    assert np.abs(found - joints).max() < 0.4, "the same posture"
+    assert (found is joints) == (height_m == 0.0)
+
+
+def test_a_hand_that_the_arm_of_training_cannot_hold_is_one_line():
+    body = on_table(small_decider().body, 2.0)
+    with pytest.raises(ValueError, match=r"cannot hold its hand where this one does; check table.height_m"):
+        joints_as_trained(SMALL.golden["joint_pos"][1], cell=body.arm, trained=small_decider().body.arm)
 
 
 def test_instances_are_masks_the_surest_on_top():
@@ -250,7 +272,7 @@ def test_a_bundle_without_parameters_cannot_be_searched_by():
     with pytest.raises(
         ValueError, match=r"has no policy.safetensors; allowed is a bundle exported with --formats onnx sa"
     ):
-        planned_cell.make_search(bundle, PlanningConfig(), start=small_decider().start(), camera_m=np.zeros(3))
+        planned_cell.make_search(bundle, PlanningConfig(), decider=small_decider(), camera_m=np.zeros(3))
 
 
 @pytest.mark.slow
@@ -260,7 +282,7 @@ def test_a_simulated_cell_searches_before_it_pushes(capsys):
     search = planned_cell.make_search(
         bundle,
         PlanningConfig(candidates=2, variants=2, depth=1),
-        start=station.decider.start(),
+        decider=station.decider,
         camera_m=station.view.camera.world_from_optical[:3, 3],
     )
     assert "compiled in" in capsys.readouterr().out

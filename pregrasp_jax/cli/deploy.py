@@ -78,7 +78,7 @@ def _with_search(station: Station, bundle: Bundle, planning: PlanningConfig) -> 
     except ImportError as error:
         raise ValueError(f"plan = True: {error.name} is not installed; allowed is pip install pregrasp_jax") from None
     camera_m = station.view.camera.world_from_optical[:3, 3]
-    search = make_search(bundle, planning, start=station.decider.start(), camera_m=camera_m, say=station.say)
+    search = make_search(bundle, planning, decider=station.decider, camera_m=camera_m, say=station.say)
     return dataclasses.replace(station, search=search)
 
 
