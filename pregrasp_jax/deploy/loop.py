@@ -140,14 +140,13 @@ class Station:
         draw_robot(depth, cut, view=self.view, body=self.decider.body, joint_pos=joints, entry=entry)
         clock.lap("drawing")
         maps = to_maps(depth, cut, view=self.view, cell=self.cell)
-        clock.lap("projection")
         choose = None
         if self.search is not None:
             instances = self.view.cut(instance_image(masks, self.view.camera.shape))
             on_grid = self._instances(depth, cut, instances, target=target + 1, maps=maps)
-            choose = functools.partial(
-                self.search.choose, Seen(maps.height_m, on_grid, target + 1, hand, joints, pushes)
-            )
+            seen = Seen(maps.height_m, on_grid, target + 1, hand, joints, pushes)
+            choose = functools.partial(self.search.choose, seen)
+        clock.lap("projection")
         decision = self.decider.decide(maps, hand, joints, search=choose, lap=clock.lap)
         clock.lap("decoding")
         return Looked(frame, labels, maps, decision, clock.times_ms)
