@@ -10,7 +10,8 @@ from pregrasp_jax.config import Config, SceneConfig
 from pregrasp_jax.deploy.bundle import Bundle
 from pregrasp_jax.deploy.contract import SAFETENSORS
 from pregrasp_jax.deploy.decision import Decider
-from pregrasp_jax.deploy.search import ROBOT, TABLE, Seen
+from pregrasp_jax.deploy.masks import ROBOT, TABLE
+from pregrasp_jax.deploy.search import Seen
 from pregrasp_jax.evaluation_config import PlanningConfig
 from pregrasp_jax.machine import announced_compilation
 from pregrasp_jax.planning.memory import NOTHING, Sight

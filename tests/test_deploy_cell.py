@@ -3,15 +3,18 @@
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from bundles import SMALL, small_bundle
+from bundles import SMALL, small_bundle, small_decider
 from PIL import Image
 
 from pregrasp_jax.cli.main import main
 from pregrasp_jax.deploy.cell import read_cell
+from pregrasp_jax.deploy.decision import allowed_pushes
 
 ROOT = Path(__file__).parent.parent
 INTRINSICS = [[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]
@@ -70,6 +73,24 @@ def test_a_dry_trial_is_decided_logged_and_drawn(tmp_path: Path, capsys):
         with pytest.raises(SystemExit) as stopped:
             main(options)
         assert stopped.value.code == 2 and problem in capsys.readouterr().err
+
+
+def test_a_dry_trial_searches_where_it_is_asked_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    cell, asked = write_cell(tmp_path), []
+    allowed = allowed_pushes(SMALL.bundle.contract.action, small_decider().start())
+    other = int(np.argsort(np.where(allowed, SMALL.golden["q"][0], -np.inf), axis=None)[-400])
+
+    def make_search(bundle: Any, planning: Any, **about: Any) -> Any:
+        asked.append((bundle.folder, planning.depth, about["camera_m"].shape))
+        return SimpleNamespace(choose=lambda seen: other)
+
+    monkeypatch.setattr("pregrasp_jax.planned_cell.make_search", make_search)
+    options = ["--config", str(cell), "--once", "True", "--plan", "True", "--planning.depth", "1"]
+    assert main(["deploy", str(small_bundle()), *options, "--log", str(tmp_path / "log")]) == 0
+    about = json.loads((tmp_path / "log" / "decision-000.json").read_text())
+    assert asked == [(small_bundle(), 1, (3,))] and "once after 1 pushes" in capsys.readouterr().out
+    assert about["searched"] == other and other in [about["push"]["action"], *(a for a, _ in about["refused"])]
+    assert "search" in about["times_ms"]
 
 
 def test_what_is_simulated_is_found_from_where_the_cell_is_written(tmp_path: Path):

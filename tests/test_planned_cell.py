@@ -12,11 +12,12 @@ from bundles import SMALL, small_bundle, small_decider
 from pregrasp_jax import planned_cell
 from pregrasp_jax.cli.main import main
 from pregrasp_jax.deploy.cell import Cell
+from pregrasp_jax.deploy.files import masks_of_ids
 from pregrasp_jax.deploy.loop import Station
-from pregrasp_jax.deploy.masks import Masks
+from pregrasp_jax.deploy.masks import ROBOT, TABLE, Masks, Target, instance_image
 from pregrasp_jax.deploy.poses import on_table
 from pregrasp_jax.deploy.projection import Maps
-from pregrasp_jax.deploy.search import ROBOT, TABLE, Seen, instance_image
+from pregrasp_jax.deploy.search import Seen
 from pregrasp_jax.evaluation_config import PlanningConfig
 from pregrasp_jax.planned_cell import CellSearch, joints_as_trained
 from pregrasp_jax.planning.memory import NOTHING, Memory, Shape, Sight
@@ -185,14 +186,14 @@ def test_a_hand_that_the_arm_of_training_cannot_hold_is_one_line():
 
 def test_instances_are_masks_the_surest_on_top():
     masks = Masks(np.stack([block(20, 20), block(24, 24)]), ("a", "b"), np.array([0.9, 0.8]))
-    image = instance_image(masks, (100, 100))
+    image = instance_image(masks)
     assert image[25, 25] == 1 and image[30, 30] == 2 and image[0, 0] == TABLE
-    with pytest.raises(ValueError, match="found 255 objects; allowed are 254"):
-        instance_image(Masks(np.zeros((255, 4, 4), bool), ("",) * 255, np.ones(255)), (4, 4))
+    with pytest.raises(ValueError, match="found 255 objects; allowed with a search are 254"):
+        instance_image(Masks(np.zeros((255, 4, 4), bool), ("",) * 255, np.ones(255)))
 
 
 class Simple:
-    """A camera, masks, an arm and a gripper that show the golden state and do nothing."""
+    """A camera, masks, an arm and a gripper which show the golden state and do nothing."""
 
     def __init__(self):
         self.pushed: list[int] = []
@@ -201,12 +202,7 @@ class Simple:
         return SMALL.golden["depth"][0], None, 0.0
 
     def segment(self, frame: Any) -> Masks:
-        ids = SMALL.golden["instances"][0]
-        found = [int(value) for value in np.unique(ids) if value]
-        return Masks(np.stack([ids == value for value in found]), tuple(map(str, found)), np.ones(len(found)))
-
-    def find(self, masks: Masks) -> int:
-        return masks.names.index(str(int(SMALL.golden["target_id"][0])))
+        return masks_of_ids(SMALL.golden["instances"][0])
 
     def joints(self) -> np.ndarray:
         return SMALL.golden["joint_pos"][0][:6]
@@ -231,7 +227,7 @@ def test_a_station_shows_a_search_what_the_policy_sees():
         view=SMALL.view,
         source=cell,
         segmenter=cell,
-        target=cell,
+        target=Target(name=str(int(SMALL.golden["target_id"][0]))),
         arm=cell,
         gripper=cell,
         depth_scale=1e-4,

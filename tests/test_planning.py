@@ -16,9 +16,10 @@ import pytest
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.config import SceneConfig, TaskConfig
+from pregrasp_jax.config import Config, PhysicsConfig, SceneConfig, TaskConfig
 from pregrasp_jax.evaluation import format_evaluation, load_evaluation
 from pregrasp_jax.evaluation.deliberation import Deliberation
+from pregrasp_jax.evaluation.learned import play
 from pregrasp_jax.evaluation.player import make_player, run_evaluation
 from pregrasp_jax.evaluation.statistics import compare
 from pregrasp_jax.evaluation_config import EvaluationConfig, PlanningConfig
@@ -29,7 +30,7 @@ from pregrasp_jax.planning.planner import Planned, Planner, spread_best
 from pregrasp_jax.planning.promise import promise_of
 from pregrasp_jax.planning.search import Choice
 from pregrasp_jax.robot.base import hand_pose_of
-from pregrasp_jax.task.assembly import make_env
+from pregrasp_jax.task.assembly import make_env, with_task
 from pregrasp_jax.types import EnvState, Observation, PhysicsObservation, SceneParams
 
 
@@ -162,6 +163,24 @@ def test_scripts_join_one_proposal_and_compiling_takes_none_of_the_first_decisio
     best = (4 * 9 + 4) * 2 + 1
     assert [candidates for candidates, _ in searched] == [[best, 5, 6]] * 3
     assert [math.isinf(deadline) for _, deadline in searched] == [True, False, False]
+
+
+@pytest.mark.parametrize("discount", [0.7, 0.95])
+def test_rebuilt_scenes_are_drawn_and_valued_as_in_training(discount: float, monkeypatch: pytest.MonkeyPatch):
+    told: list[Any] = []
+    monkeypatch.setattr(planner, "Planner", lambda env, *_, **about: told.append((env, about)))
+    trained = load_policy("pretrained")
+    learner = dataclasses.replace(trained.config.learner, discount=discount)
+    trained = dataclasses.replace(trained, config=dataclasses.replace(trained.config, learner=learner))
+    task = dataclasses.replace(trained.config.task, camera="pinhole", sensor="d455")
+    env = make_env(Config(task=task, scene=SceneConfig(test_scenes=2)), split="test", threads=1)
+    request = EvaluationConfig(policy="pretrained", plan=True, physics=PhysicsConfig(threads=1))
+    play(env, trained, "", request)
+    play(with_task(env, camera="orthographic", sensor="clean"), trained, "", request)
+    (through_pinhole, about), (_, above) = told
+    assert (through_pinhole.task.camera, through_pinhole.task.sensor) == ("orthographic", "clean")
+    assert above["camera_m"] is None and about["camera_m"].shape == (3,) and about["camera_m"][2] > 0.9
+    assert about["promise"] == promise_of(trained.config.task, discount) and about["threads"] == 1
 
 
 @pytest.mark.slow

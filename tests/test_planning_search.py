@@ -152,7 +152,7 @@ def test_without_time_one_round_decides():
 @pytest.mark.parametrize("discount", [0.5, 0.7, 0.85, 0.99])
 def test_chances_rise_with_values_and_are_in_rewards_of_a_success(approach: float, discount: float):
     found = promise_of(TaskConfig(approach_reward=approach), discount)(np.linspace(-1, 3, 50))
-    assert (np.diff(found) >= 0).all() and 0 <= found[0] < 0.1 and 0.9 < found[-1] < 1
+    assert (np.diff(found) >= 0).all() and 0 < found[0] < 0.1 and 0.9 < found[-1] < 1
     tripled = promise_of(TaskConfig(approach_reward=approach, in_region_reward=6.0), discount)(
         3 * np.linspace(-1, 3, 50)
     )

@@ -12,9 +12,9 @@ from pregrasp_jax.deploy.camera import depth_in_metres
 from pregrasp_jax.deploy.decision import Decider, Decision
 from pregrasp_jax.deploy.devices import ArmDriver, Frame, GripperDriver, ImageSource, Segmenter
 from pregrasp_jax.deploy.log import DecisionLog
-from pregrasp_jax.deploy.masks import Target, fuse
+from pregrasp_jax.deploy.masks import ROBOT, Target, fuse, instance_image
 from pregrasp_jax.deploy.projection import Maps, draw_robot, to_maps
-from pregrasp_jax.deploy.search import ROBOT, Search, Seen, instance_image
+from pregrasp_jax.deploy.search import Search, Seen
 from pregrasp_jax.deploy.view import View
 from pregrasp_jax.sensors import PointOfCell
 from pregrasp_jax.spaces import motion
@@ -142,7 +142,7 @@ class Station:
         maps = to_maps(depth, cut, view=self.view, cell=self.cell)
         choose = None
         if self.search is not None:
-            instances = self.view.cut(instance_image(masks, self.view.camera.shape))
+            instances = self.view.cut(instance_image(masks))
             on_grid = self._instances(depth, cut, instances, target=target + 1, maps=maps)
             seen = Seen(maps.height_m, on_grid, target + 1, hand, joints, pushes)
             choose = functools.partial(self.search.choose, seen)

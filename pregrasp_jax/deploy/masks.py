@@ -1,6 +1,6 @@
 """Instance masks with a target, from whichever segmenter, as one image of labels."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,9 @@ THRESHOLD = 0.5
 
 _MIN_PIXELS = 20
 """A mask with fewer is none."""
+
+TABLE, ROBOT = 0, 255
+"""Instances that are no mask's."""
 
 
 @dataclass(frozen=True)
@@ -78,13 +81,32 @@ def fuse(masks: Masks, target: int, labels: Mapping[str, int], shape: tuple[int,
     """
     if masks.masks.shape[1:] != shape:
         raise ValueError(f"masks have shape {list(masks.masks.shape)}; allowed is N x {shape[0]} x {shape[1]}")
-    image = np.full(shape, labels["table"], np.uint8)
-    for index in reversed(range(len(masks.masks))):  # the surest last, on top
-        image[masks.masks[index]] = labels["target" if index == target else "obstacle"]
+    values = [labels["target" if index == target else "obstacle"] for index in range(len(masks.masks))]
+    image = _paint(masks, values, table=labels["table"])
     if (image == labels["target"]).sum() < _MIN_PIXELS:
         raise ValueError(
             f"the mask of the target has {(image == labels['target']).sum()} visible pixels; allowed is {_MIN_PIXELS}"
         )
+    return image
+
+
+def instance_image(masks: Masks) -> np.ndarray:
+    """Return the instances [rows, columns] uint8 of masks: `TABLE`, or index + 1 of the one that counts, as in `fuse`.
+
+    Raises:
+        ValueError: too many of them.
+    """
+    count = len(masks.masks)
+    if count >= ROBOT:
+        raise ValueError(f"the segmenter has found {count} objects; allowed with a search are {ROBOT - 1}")
+    return _paint(masks, range(1, count + 1), table=TABLE)
+
+
+def _paint(masks: Masks, values: Sequence[int], *, table: int) -> np.ndarray:
+    """Return an image [rows, columns] uint8 with a value for each mask, the surest on top."""
+    image = np.full(masks.masks.shape[1:], table, np.uint8)
+    for mask, value in zip(masks.masks[::-1], values[::-1], strict=True):
+        image[mask] = value
     return image
 
 

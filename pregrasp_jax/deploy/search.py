@@ -4,11 +4,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from pregrasp_jax.deploy.masks import Masks
 from pregrasp_jax.spaces import motion
-
-TABLE, ROBOT = 0, 255
-"""Instances of a map that are no mask's."""
 
 
 class Seen(NamedTuple):
@@ -16,7 +12,7 @@ class Seen(NamedTuple):
 
     Attributes:
         height_m: [H, W] float32.
-        instances: [H, W] uint8, `TABLE`, index + 1 of a mask, or `ROBOT`; indices of one object differ between looks.
+        instances: [H, W] uint8, `masks.TABLE`, `masks.ROBOT`, or index + 1 of a mask, which differs from look to look.
         target: instance of the target.
         hand: commanded end of the last push.
         joint_pos: [J] rad, measured.
@@ -41,18 +37,3 @@ class Search(Protocol):
             ValueError: what is seen cannot be used.
         """
         ...
-
-
-def instance_image(masks: Masks, shape: tuple[int, int]) -> np.ndarray:
-    """Return the instances [rows, columns] uint8 of masks; where they overlap the surest one counts, as in `fuse`.
-
-    Raises:
-        ValueError: too many of them.
-    """
-    count = len(masks.masks)
-    if count >= ROBOT:
-        raise ValueError(f"the segmenter has found {count} objects; allowed are {ROBOT - 1}")
-    image = np.full(shape, TABLE, np.uint8)
-    for index in reversed(range(count)):
-        image[masks.masks[index]] = index + 1
-    return image

@@ -15,6 +15,9 @@ TARGET_SLOT = 0
 _FAR = 0.3
 """m that no object moves between two pictures: a push is 0.2 m long."""
 
+_NEVER = 1e3
+"""Cost of what cannot be the same object."""
+
 _PER_METRE, _PER_HEIGHT = 10.0, 20.0
 """What a metre of way, and one of height, weigh against a size that differs by a factor of e."""
 
@@ -41,9 +44,8 @@ def slots_of(masks: Sequence[np.ndarray], height: np.ndarray, target: int, memor
     known = [slot for slot, shape in enumerate(memory) if shape is not None and slot != TARGET_SLOT]
     costs = np.array([[_cost(masks[index], height, memory, slot) for slot in known] for index in others])
     costs = costs.reshape(len(others), len(known))
-    never = 1e3
-    for row, column in zip(*linear_sum_assignment(np.minimum(costs, never)), strict=True):
-        if costs[row, column] < never:
+    for row, column in zip(*linear_sum_assignment(costs), strict=True):
+        if costs[row, column] < _NEVER:
             found[others[row]] = known[column]
     taken = set(found.values())
     # A free slot is better than that of something that may only be hidden.
@@ -53,11 +55,11 @@ def slots_of(masks: Sequence[np.ndarray], height: np.ndarray, target: int, memor
 
 
 def _cost(mask: np.ndarray, height: np.ndarray, memory: Memory, slot: int) -> float:
-    """Return how unlike what is seen in the cells `mask` is to what is remembered; infinite if it is too far away."""
+    """Return how unlike what is seen in the cells `mask` is to what is remembered; `_NEVER` if it is too far away."""
     shape = memory[slot]
     assert shape is not None
     way = float(np.linalg.norm(grid.cell_to_world(*np.nonzero(mask)).mean(axis=0) - shape.pose[:2]))
     if way > _FAR:
-        return np.inf
+        return _NEVER
     size = abs(float(np.log(mask.sum() / len(shape.xy))))
     return _PER_METRE * way + size + _PER_HEIGHT * abs(float(height[mask].max() - shape.height.max()))
