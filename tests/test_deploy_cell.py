@@ -69,6 +69,8 @@ def test_a_dry_trial_is_decided_logged_and_drawn(tmp_path: Path, capsys):
     for options, problem in (
         (["deploy", str(small_bundle()), "--config", str(cell), "--log", str(log)], "of an earlier trial"),
         (["deploy", "--replay", str(tmp_path)], "holds no decisions"),
+        (["deploy", "--replay", str(log), "--config", str(cell)], "--replay FOLDER alone"),
+        (["deploy", str(small_bundle()), "--replay", str(log)], "--replay FOLDER alone"),
     ):
         with pytest.raises(SystemExit) as stopped:
             main(options)

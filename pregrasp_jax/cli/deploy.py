@@ -43,6 +43,9 @@ def deploy(
     from pregrasp_jax.deploy.log import draw_log
 
     if replay is not None:
+        others = (bundle, config, arm, gripper, once, plan, planning, log)
+        if others != (None, None, "dry", None, False, False, _PLANNING, None):
+            raise ValueError("--replay draws a log and does nothing else; allowed is --replay FOLDER alone")
         for picture in draw_log(replay):
             print(f"wrote {picture}")
         return
