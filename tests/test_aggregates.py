@@ -42,7 +42,7 @@ def test_one_seed_is_a_bootstrap_over_scenes():
     sample = np.arange(200) < 150
     low, high = aggregates.interval(outcomes([sample]))
     expected = stats.bootstrap((sample.astype(float),), np.mean, n_resamples=2000, method="percentile", rng=0)
-    assert (low, high) == pytest.approx(tuple(expected.confidence_interval), abs=0.01)
+    assert (low, high) == pytest.approx(tuple(expected.confidence_interval), abs=2 / 200 + 1e-9)  # two scenes
 
 
 @pytest.mark.parametrize(("seeds", "least"), [(3, 0.86), (6, 0.9)])
@@ -69,6 +69,20 @@ def test_nothing_but_successes_or_failures_is_not_certainty():
     assert aggregates.compare_settings(all_good, all_bad).p_value < 0.01
     low, high = aggregates.measured_interval([0.0], 2)
     assert low == 0 and high == pytest.approx(stats.binomtest(0, 2).proportion_ci(method="wilson").high, abs=1e-6)
+
+
+@pytest.mark.parametrize(("one", "other"), [(1, 1), (1, 3), (3, 3), (2, 5)])
+def test_draws_that_tie_are_ties_whatever_the_number_of_seeds(one, other):
+    success = np.random.default_rng(5).random((1, 100)) < 0.7
+    a, b = (outcomes(np.repeat(success, seeds, axis=0)) for seeds in (one, other))
+    assert aggregates.compare_settings(a, b).p_value == 1
+    perfect, once_bad = np.ones((one, 100), bool), np.ones((other, 100), bool)
+    once_bad[:, 0] = False
+    share_without_it = (99 / 100) ** 100
+    found = aggregates.compare_settings(outcomes(perfect), outcomes(once_bad))
+    assert found.p_value == pytest.approx(2 * share_without_it, abs=0.06) and found.interval[0] == 0
+    clear = aggregates.compare_settings(outcomes(perfect), outcomes(np.zeros((other, 100))))
+    assert 0.9 < clear.interval[0] < 1
 
 
 def test_pairing_by_scene_narrows_the_interval_of_a_difference():
