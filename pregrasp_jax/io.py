@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO, cast
 
@@ -105,7 +105,7 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:
         OSError: the disk is full or does not allow it; its `filename` is set.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=hidden(path), suffix=PARTIAL, dir=path.parent)
+    handle, temporary = tempfile.mkstemp(prefix=_hidden(path), suffix=PARTIAL, dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
             write(file)
@@ -120,7 +120,29 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:
         raise
 
 
-def hidden(path: Path) -> str:
+@contextlib.contextmanager
+def staged_folder(folder: Path) -> Iterator[Path]:
+    """Give an empty folder to write into; when that is done it takes the place of `folder` and of what is in there.
+
+    After an error nothing has changed. A process that is killed leaves the old folder or the new one, whole; between
+    two renames the old one has a hidden name beside its place.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=_hidden(folder), suffix=PARTIAL, dir=folder.parent) as beside:
+        new, old = Path(beside, "new"), Path(beside, "old")
+        new.mkdir()
+        yield new
+        try:
+            if folder.is_dir():
+                folder.rename(old)
+            new.rename(folder)
+        except BaseException:
+            if old.is_dir():
+                old.rename(folder)
+            raise
+
+
+def _hidden(path: Path) -> str:
     """Return how the temporary name of a file or folder begins; as long as the name itself it could be too long."""
     return f".{path.name[:32]}."
 
@@ -141,13 +163,13 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
-def append_json_line(path: Path, value: Any) -> None:
-    """Append `value` as one line of JSON, whole or not at all.
+def append_json_lines(path: Path, *values: Any) -> None:
+    """Append values as lines of JSON, all of them whole or nothing at all.
 
     Raises:
         OSError: the disk is full.
     """
-    data = (json.dumps(value, allow_nan=False) + "\n").encode()
+    data = "".join(json.dumps(value, allow_nan=False) + "\n" for value in values).encode()
     with path.open("ab", buffering=0) as file:
         length = file.tell()
         if file.write(data) < len(data):  # what a full disk does at first; only the next write raises

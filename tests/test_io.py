@@ -2,6 +2,7 @@
 
 import errno
 import os
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +22,32 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
     with pytest.raises(OSError, match="No space"):
         io.write_atomic(path, fail)
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["file"]
+
+
+def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
+    folder = tmp_path / "bundle"
+
+    def fill(text: str) -> None:
+        with io.staged_folder(folder) as staged:
+            (staged / text).write_text(text)
+
+    fill("old")
+    rename = Path.rename
+
+    def crash(self: Path, to: Path) -> Path:
+        if self.name == "new":
+            raise KeyboardInterrupt
+        return rename(self, to)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Path, "rename", crash)
+        fill("new")
+    assert (folder / "old").read_text() == "old" and os.listdir(folder) == ["old"]
+    with pytest.raises(RuntimeError), io.staged_folder(folder):
+        raise RuntimeError
+    assert os.listdir(folder) == ["old"] and os.listdir(tmp_path) == ["bundle"]
+    fill("new")
+    assert os.listdir(folder) == ["new"] and os.listdir(tmp_path) == ["bundle"]
 
 
 def test_a_name_that_is_too_long_is_refused_before_the_work_and_one_that_fits_can_be_written(tmp_path):

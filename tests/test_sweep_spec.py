@@ -193,7 +193,7 @@ def test_a_grid_is_whole_and_shuffled_and_draws_are_repeatable_typed_and_in_rang
 def test_command_lines_are_what_a_person_would_type(tmp_path):
     settings = {"replay.hindsight": False, "physics.engine": "native", "train.fused_iterations": None}
     spec = spec_from(changed(set=settings))
-    trial = make_trial(spec, {"learner.learning_rate": 0.00025}, 3, number=0, init_from="pretrained")
+    trial = make_trial(spec, {"learner.learning_rate": 0.00025}, 3, init_from="pretrained")
     words = " ".join(train_command(spec, trial, tmp_path / "run")[3:])
     assert words == (
         f"train cpu --run-dir {tmp_path}/run --films False --init-from pretrained --seed 3 --physics.threads 1 "
@@ -211,16 +211,16 @@ def test_command_lines_are_what_a_person_would_type(tmp_path):
 
 def test_an_id_is_of_what_a_trial_is_and_of_nothing_else():
     spec = spec_from(FULL)
-    first = make_trial(spec, {"task.r_out": 0.15}, 0, number=0)
-    assert first.id == make_trial(spec, {"task.r_out": 0.15}, 0, number=7, name="x", final=True).id
+    first = make_trial(spec, {"task.r_out": 0.15}, 0)
+    assert first.id == make_trial(spec, {"task.r_out": 0.15}, 0, name="x", final=True).id
     others = [
-        make_trial(spec, {"task.r_out": 0.2}, 0, number=0),
-        make_trial(spec, {"task.r_out": 0.15}, 1, number=0),
-        make_trial(spec, {"task.r_out": 0.15}, 0, number=0, init_from="pretrained"),
-        make_trial(spec_from(changed(preset="demo")), {"task.r_out": 0.15}, 0, number=0),
+        make_trial(spec, {"task.r_out": 0.2}, 0),
+        make_trial(spec, {"task.r_out": 0.15}, 1),
+        make_trial(spec, {"task.r_out": 0.15}, 0, init_from="pretrained"),
+        make_trial(spec_from(changed(preset="demo")), {"task.r_out": 0.15}, 0),
     ]
     assert len({trial.id for trial in [first, *others]}) == 5
-    assert first.group == make_trial(spec, {"task.r_out": 0.15}, 1, number=0).group != others[0].group
+    assert first.group == make_trial(spec, {"task.r_out": 0.15}, 1).group != others[0].group
 
 
 def halving(scores: dict[float, list[float | None]], reached: int) -> tuple[Spec, list[TrialState]]:
@@ -228,7 +228,7 @@ def halving(scores: dict[float, list[float | None]], reached: int) -> tuple[Spec
     spec = spec_from(changed(stop={"method": "halving", "rungs": [2000, 4000], "keep": 0.5}))
     states = []
     for radius, of_seeds in scores.items():
-        for trial, score in zip(setting_trials(spec, {"task.r_out": radius}, len(states)), of_seeds, strict=True):
+        for trial, score in zip(setting_trials(spec, {"task.r_out": radius}), of_seeds, strict=True):
             known = TrialState(trial, outcome="rung", begun=True)
             if score is None:
                 known.outcome, known.failures = "failed", TRIES
@@ -254,6 +254,14 @@ def test_the_better_half_by_the_mean_over_seeds_goes_on_and_a_failed_one_is_none
     assert {s.trial.settings["task.r_out"] for s in states if s.trial.id in state.dropped(spec, states)} == {0.14, 0.16}
 
 
+def test_the_share_that_is_kept_is_of_the_number_of_settings():
+    assert 0.28 * 25 > 7, "in binary fractions"
+    spec = spec_from(changed(stop={"method": "halving", "rungs": [2000], "keep": 0.28}, seeds=[0]))
+    trials = [setting_trials(spec, {"task.r_out": 0.1 + i / 1000})[0] for i in range(25)]
+    states = [TrialState(trial, scores={2000: i / 25}) for i, trial in enumerate(trials)]
+    assert len(state.survivors(spec, states, 2000)) == 7
+
+
 def test_who_passed_the_last_rung_goes_to_the_end_and_is_ranked_before_who_did_not():
     spec, states = halving({0.1: [0.5, 0.5], 0.12: [0.6, 0.6], 0.14: [0.1, 0.1], 0.16: [0.2, 0.2]}, reached=2)
     for s in states[4:]:
@@ -272,7 +280,7 @@ def test_who_passed_the_last_rung_goes_to_the_end_and_is_ranked_before_who_did_n
 
 def test_states_are_read_from_events_planned_twice_or_not():
     spec = spec_from(FULL)
-    trial = make_trial(spec, {"task.r_out": 0.15}, 0, number=0)
+    trial = make_trial(spec, {"task.r_out": 0.15}, 0)
     planned = {"event": "planned", "trial": trial.to_dict()}
     ended = {"event": "ended", "id": trial.id, "rung": None, "outcome": "failed", "seconds": 2.0, "message": "boom"}
     (known,) = read_states([{"event": "sweep"}, planned, planned, {"event": "started", "id": trial.id}, ended, ended])

@@ -4,8 +4,6 @@ import dataclasses
 import hashlib
 import io as bytes_io
 import json
-import shutil
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -103,19 +101,11 @@ def _write(folder: Path, contract: Contract, files: dict[str, bytes]) -> Contrac
         for name, data in sorted(files.items())
     }
     contract = dataclasses.replace(contract, files=entries)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    staged = Path(tempfile.mkdtemp(prefix=io.hidden(folder), suffix=io.PARTIAL, dir=folder.parent))
-    try:
+    with io.staged_folder(folder) as staged:
         for name, data in files.items():
             io.write_bytes(staged / name, data)
         io.write_json(staged / names.CONTRACT, to_plain(contract))
         io.write_bytes(staged / names.README, (format_contract(contract) + "\n").encode())
-        staged.chmod(0o755)
-        if folder.is_dir():
-            shutil.rmtree(folder)
-        staged.rename(folder)
-    finally:
-        shutil.rmtree(staged, ignore_errors=True)
     return contract
 
 

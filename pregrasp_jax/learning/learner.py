@@ -120,7 +120,7 @@ def update(
         The next state, TD errors [B, K] of the mean of all members, signed, 0 where nothing is known of the next state,
         the values [B, K] of the next states, `UNKNOWN` where they are not, and metrics () each.
     """
-    count = math.ceil(config.valued_share * len(batch.drawn))
+    count = math.ceil(config.valued_share * len(batch.drawn) - 1e-9)
     chosen = to_value(batch, count, state.gradient_steps)
     inputs, hands = jax.tree.map(lambda leaf: leaf[chosen], (batch.next_inputs, batch.next_hand))
     fresh = jax.vmap(max_q)(q.apply(state.target_params, inputs), jax.vmap(mask_fn)(hands))

@@ -83,7 +83,7 @@ class Driver:
             if idle > 0 and self._propose(states):
                 continue
             if not (jobs or self._submitted):
-                if plan_finals(self.folder, self.spec, states):
+                if plan_finals(self.folder, self.spec):
                     continue
                 self._tell(states, ended=True)
                 return 1 if any(s.failed for s in states) else 0
@@ -137,8 +137,7 @@ class Driver:
         varied, proposal = self._study.propose(states)
         if varied is None:
             return False
-        for trial in setting_trials(self.spec, varied, len(states), proposal=proposal):
-            self.folder.append({"event": "planned", "trial": trial.to_dict()})
+        self.folder.plan(lambda _: setting_trials(self.spec, varied, proposal=proposal))
         return True
 
     def _stop(self) -> int:
@@ -165,25 +164,15 @@ class Driver:
 
 def plan(folder: SweepFolder, spec: Spec) -> None:
     """Write down all trials that are known from the start, once."""
-    known = {s.trial.id for s in folder.states()}
-    number = 0
-    for varied, about in checks.settings_of(spec) or ():
-        for trial in setting_trials(spec, varied, number, **about):
-            number += 1
-            if trial.id not in known:
-                folder.append({"event": "planned", "trial": trial.to_dict()})
+    settings = checks.settings_of(spec) or ()
+    folder.plan(lambda _: [trial for varied, about in settings for trial in setting_trials(spec, varied, **about)])
 
 
-def plan_finals(folder: SweepFolder, spec: Spec, states: Sequence[TrialState]) -> bool:
+def plan_finals(folder: SweepFolder, spec: Spec) -> bool:
     """Write down the fresh seeds of the winners; return whether there are new ones."""
     if not spec.final.seeds:
         return False
-    known = {s.trial.id for s in states}
-    trials = final_trials(spec, state.winners(spec, states), len(states))
-    new = [trial for trial in trials if trial.id not in known]
-    for trial in new:
-        folder.append({"event": "planned", "trial": trial.to_dict()})
-    return bool(new)
+    return folder.plan(lambda states: final_trials(spec, state.winners(spec, states)))
 
 
 def progress_line(spec: Spec, states: Sequence[TrialState], *, running: int, slots: int) -> str:

@@ -47,7 +47,7 @@ def describe(spec: Spec, *, launcher: str = "local", parallel: int | None = None
         f"about {whole / slots / 3600:.1f} hours, at the speed of two cores of docs/presets.md",
     ]
     for varied, about in trained[:1]:
-        command = train_command(spec, make_trial(spec, varied, spec.seeds[0], number=0, **about), Path("RUN"))
+        command = train_command(spec, make_trial(spec, varied, spec.seeds[0], **about), Path("RUN"))
         lines.append(f"the first: {shlex.join(command)}")
     return lines
 

@@ -13,7 +13,7 @@ import json
 import os
 import socket
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
@@ -122,10 +122,30 @@ class SweepFolder:
         Raises:
             OSError: the disk is full.
         """
-        about = {"time": round(time.time(), 1), "host": socket.gethostname(), "pid": os.getpid()}
         with self._locked_file("trials", patience=_FOR_EVER):
-            _cut_partial_line(self.path / TRIALS)
-            io.append_json_line(self.path / TRIALS, {**event, **about})
+            self._append(event)
+
+    def plan(self, trials_of: Callable[[Sequence[TrialState]], Iterable[Trial]]) -> bool:
+        """Add the trials that are not planned yet, all or none of them, and number them; return whether there are any.
+
+        Args:
+            trials_of: makes trials from those that there are. Nobody else adds any meanwhile.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        with self._locked_file("trials", patience=_FOR_EVER):
+            states = self.states()
+            known = {s.trial.id for s in states}
+            new = [trial for trial in trials_of(states) if trial.id not in known]
+            numbered = [dataclasses.replace(trial, number=len(states) + i) for i, trial in enumerate(new)]
+            self._append(*({"event": "planned", "trial": trial.to_dict()} for trial in numbered))
+        return bool(new)
+
+    def _append(self, *events: Mapping[str, Any]) -> None:
+        about = {"time": round(time.time(), 1), "host": socket.gethostname(), "pid": os.getpid()}
+        _cut_partial_line(self.path / TRIALS)
+        io.append_json_lines(self.path / TRIALS, *({**event, **about} for event in events))
 
     def events(self) -> list[Record]:
         """Return all events in order; a last line without an end is still being written."""

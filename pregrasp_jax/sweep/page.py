@@ -1,6 +1,7 @@
 """The page of a sweep: what was found, how sure it is, and how to use it; in one file that needs nothing else."""
 
 import datetime
+import re
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -112,7 +113,7 @@ def _score(row: Row, table: Table) -> str:
 
 def _noted(table: Table) -> Iterator[Markup]:
     for note in notes(table):
-        yield element("p", note.replace("-", "\N{MINUS SIGN}") if "minus" in note else note)
+        yield element("p", re.sub(r" -(?=\d)", " \N{MINUS SIGN}", note))
     text = (
         f"{table.metric} is the best that each seed reached on validation scenes, so it flatters; intervals there are "
         "over seeds or scenes, whichever is wider. Tests are of scenes that no training and no choice has seen; their "

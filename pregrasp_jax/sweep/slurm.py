@@ -111,7 +111,7 @@ def trial_of(folder: SweepFolder, spec: Spec, task: int, *, rung: int | None, fi
     """
     states = folder.states()
     if final:
-        driver.plan_finals(folder, spec, states)
+        driver.plan_finals(folder, spec)
         chosen = [s.trial for s in folder.states() if s.trial.final]
         return chosen[task] if task < len(chosen) else None
     found = next((s.trial for s in states if s.trial.number == task), None)

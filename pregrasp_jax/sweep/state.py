@@ -134,7 +134,7 @@ def survivors(spec: Spec, states: Sequence[TrialState], rung: int) -> list[Trial
         for group, members in by_setting(states).items()
     }
     whole = sorted((group for group in scores if scores[group] > -math.inf), key=lambda group: -scores[group])
-    kept = set(whole[: math.ceil(spec.stop.keep * len(scores))])
+    kept = set(whole[: math.ceil(spec.stop.keep * len(scores) - 1e-9)])
     return [state for state in states if state.trial.group in kept]
 
 

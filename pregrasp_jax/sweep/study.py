@@ -66,7 +66,7 @@ class Study:
         for _ in range(100):
             asked = self._study.ask()
             setting = {name: _suggest(asked, name, parameter) for name, parameter in self._spec.parameters.items()}
-            if make_trial(self._spec, setting, 0, number=0).group not in groups:
+            if make_trial(self._spec, setting, 0).group not in groups:
                 return setting, asked.number
             self._study.tell(asked.number, state=self._optuna.trial.TrialState.FAIL)
         self._exhausted = True

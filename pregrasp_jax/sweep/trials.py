@@ -20,7 +20,6 @@ class Trial:
     """One training, or one evaluation of a policy that is there already.
 
     Attributes:
-        number: in the order of the sweep, from 0.
         id: hash of all that makes the trial, and the name of its run folder.
         name: of its variant; empty in a search.
         varied: dotted name -> value, what makes the setting differ from the others.
@@ -30,9 +29,9 @@ class Trial:
         init_from: whose parameters the training begins with.
         final: whether it is one of the fresh seeds at the end.
         proposal: its number in the study of a search that learns.
+        number: in the order of the sweep, from 0; -1 until the sweep plans it.
     """
 
-    number: int
     id: str
     name: str = ""
     varied: Mapping[str, Any] = field(default_factory=dict)
@@ -42,6 +41,7 @@ class Trial:
     init_from: str | None = None
     final: bool = False
     proposal: int | None = None
+    number: int = -1
 
     @property
     def group(self) -> str:
@@ -72,20 +72,18 @@ def make_trial(spec: Spec, varied: Mapping[str, Any], seed: int, **about: Any) -
     return Trial(id=io.content_hash(*what), varied=dict(varied), settings=settings, seed=seed, **about)
 
 
-def setting_trials(spec: Spec, varied: Mapping[str, Any], first: int, **about: Any) -> list[Trial]:
+def setting_trials(spec: Spec, varied: Mapping[str, Any], **about: Any) -> list[Trial]:
     """Return the trials of one setting, one per seed; a policy that is not trained needs no more than one."""
     seeds = spec.seeds if about.get("policy") is None else spec.seeds[:1]
-    return [make_trial(spec, varied, seed, number=first + i, **about) for i, seed in enumerate(seeds)]
+    return [make_trial(spec, varied, seed, **about) for seed in seeds]
 
 
-def final_trials(spec: Spec, winners: Iterable[Trial], first: int) -> list[Trial]:
+def final_trials(spec: Spec, winners: Iterable[Trial]) -> list[Trial]:
     """Return the trials of the best settings with fresh seeds."""
-    pairs = [(winner, seed) for winner in winners for seed in spec.final.seeds]
     return [
-        make_trial(
-            spec, winner.varied, seed, number=first + i, name=winner.name, init_from=winner.init_from, final=True
-        )
-        for i, (winner, seed) in enumerate(pairs)
+        make_trial(spec, winner.varied, seed, name=winner.name, init_from=winner.init_from, final=True)
+        for winner in winners
+        for seed in spec.final.seeds
     ]
 
 

@@ -156,7 +156,7 @@ class RunFolder:
         Raises:
             OSError: the disk is full.
         """
-        io.append_json_line(self.metrics, row)
+        io.append_json_lines(self.metrics, row)
         if self._event_log:
             self._event_log.append(row)
 
