@@ -56,8 +56,8 @@ import hashlib, os, sys, time
 from pregrasp_jax.training.interrupt import Interrupt
 
 def say(line):
-    if sys.argv[1] == "slow" and line.startswith("stopping"):
-        time.sleep(0.3)
+    if not line.startswith("ready"):
+        time.sleep({"slow": 0.3, "stuck": 1e6}.get(sys.argv[1], 0))
     print(line + "\\n", end="", flush=True)  # in one piece: the signal is answered in a thread of its own
 
 with Interrupt(say, lambda: say("cursor back")) as interrupt:
@@ -103,6 +103,15 @@ def test_a_signal_counts_though_it_cannot_be_answered():
     process.stdout.close()
     process.send_signal(signal.SIGTERM)
     assert process.wait(timeout=20) == 143
+
+
+def test_the_second_signal_is_heard_though_the_console_takes_nothing():
+    """A paused terminal, or a pipe that nobody reads: a line takes for ever, and so does restoring it."""
+    process = _listener("stuck")
+    process.send_signal(signal.SIGTERM)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=10) == 143
 
 
 def test_the_second_signal_ends_a_busy_process_at_once():

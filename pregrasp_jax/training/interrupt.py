@@ -10,7 +10,9 @@ from types import FrameType
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 SECONDS_TO_ANSWER = 1.0
-"""How long the end of a loop waits for the answer to a signal; a console that takes nothing is left then."""
+"""How long the end of a loop, or of the process, waits for the console; one that takes nothing is left then."""
+
+_ANSWER = "stopping: this step is finished and a checkpoint is written; a second signal ends at once"
 
 
 class Interrupt:
@@ -18,7 +20,9 @@ class Interrupt:
 
     Python runs signal handlers between bytecodes, so a compilation or a batch of pushes would delay an answer
     by seconds. The interpreter's wake-up file descriptor is written by the C handler itself: a thread that reads it
-    answers immediately. Ending at once is safe because every file of a run is written beside and renamed.
+    answers immediately. What it says has a thread of its own: a terminal that is paused, or a pipe that nobody reads,
+    must not keep the second signal from being heard. Ending at once is safe because every file of a run is written
+    beside and renamed.
     """
 
     def __init__(self, say: Callable[[str], None], before_exit: Callable[[], None] = lambda: None):
@@ -31,6 +35,7 @@ class Interrupt:
         self._say = say
         self._before_exit = before_exit
         self._signal: int | None = None
+        self._answer: threading.Thread | None = None
 
     @property
     def exit_code(self) -> int | None:
@@ -54,21 +59,27 @@ class Interrupt:
             signal.signal(number, handler)
         self._writer.close()
         self._thread.join(SECONDS_TO_ANSWER)
+        if self._answer is not None:
+            self._answer.join(SECONDS_TO_ANSWER)
 
     def _listen(self) -> None:
         with self._reader:
             while number := self._reader.recv(1):
                 if number[0] in SIGNALS:
-                    self._answer(number[0])
+                    self._obey(number[0])
 
-    def _answer(self, number: int) -> None:
+    def _obey(self, number: int) -> None:
         if self._signal is not None:
-            try:
-                self._before_exit()
-            finally:
-                os._exit(128 + number)
+            _start(self._before_exit).join(SECONDS_TO_ANSWER)
+            os._exit(128 + number)
         self._signal = number
-        self._say("stopping: this step is finished and a checkpoint is written; a second signal ends at once")
+        self._answer = _start(lambda: self._say(_ANSWER))
+
+
+def _start(call: Callable[[], None]) -> threading.Thread:
+    thread = threading.Thread(target=call, daemon=True)
+    thread.start()
+    return thread
 
 
 def _ignore(number: int, frame: FrameType | None) -> None:
