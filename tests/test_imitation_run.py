@@ -113,6 +113,17 @@ def test_the_split_is_disjoint_and_keeps_to_the_singulation_condition():
         split(grasps(3), 3, make_config(singulation=True))
 
 
+@pytest.mark.parametrize("size", [1, 4, 8, 10, 16])
+def test_every_grasp_counts_once_in_a_validation_loss(size):
+    rows, losses = np.arange(3, 13), np.random.default_rng(0).normal(size=(2, 13))
+
+    def losses_of(chunk: np.ndarray) -> np.ndarray:
+        assert chunk.shape == (size,)
+        return losses[:, chunk]
+
+    np.testing.assert_allclose(imitation.mean_losses(losses_of, rows, size), losses[:, 3:].mean(axis=1))
+
+
 def test_the_measures_of_ppgs_own_protocol():
     scenes = [
         Cleared(scene=0, objects=5, removed=4, stable=(True, False, True), collided=1),

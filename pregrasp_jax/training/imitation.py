@@ -103,6 +103,15 @@ def run(config: Config, env: Env, folder: RunFolder, console: Console, *, resume
     return f"done: {session.counters.written} stable grasps learnt from; validation loss: {losses}"
 
 
+def mean_losses(losses_of: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, size: int) -> np.ndarray:
+    """Return the mean losses [L] over rows [N], of which `losses_of` takes `size` at once and gives [L, size].
+
+    The last batch is filled up with the first rows, which count once nevertheless.
+    """
+    chunks = np.resize(rows, -(-len(rows) // size) * size).reshape(-1, size)
+    return np.concatenate([losses_of(chunk) for chunk in chunks], axis=1)[:, : len(rows)].mean(axis=1)
+
+
 class _Session:
     """A run in memory."""
 
@@ -201,12 +210,12 @@ class _Session:
 
     def _validate(self, rows: np.ndarray) -> None:
         """Measure both networks on grasps that they have not learnt from, and keep what is better than before."""
-        params, size = self.state["learner"].params, self.config.strokes.batch_size
-        total = np.zeros(2)
-        for chunk in np.resize(rows, -(-len(rows) // size) * size).reshape(-1, size):
-            batch = jax.tree.map(lambda leaf, chunk=chunk: leaf[chunk], self.positives)
-            total += [float(np.mean(loss)) for loss in self._losses_of(params, batch)]
-        start, aperture = (total / -(-len(rows) // size)).tolist()
+        params = self.state["learner"].params
+
+        def losses_of(chunk: np.ndarray) -> np.ndarray:
+            return np.stack(self._losses_of(params, jax.tree.map(lambda leaf: leaf[chunk], self.positives)))
+
+        start, aperture = mean_losses(losses_of, rows, self.config.strokes.batch_size).tolist()
         losses = {"start": start, "aperture": aperture}
         best = self.counters.best
         for name, loss in losses.items():
