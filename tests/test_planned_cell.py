@@ -236,7 +236,9 @@ def test_a_station_shows_a_search_what_the_policy_sees():
     )
     station.run(once=True)
     looked = station.look(small_decider().start(), pushes=3)
+    last = station.look(small_decider().start(), pushes=small_decider().contract.action.max_pushes)
     assert cell.pushed == [SMALL.golden["action"][0]] and [now.pushes for now in seen] == [0, 3]
+    assert last.decision.searched is None, "there is no push left to search for"
     assert "search" in looked.times_ms and looked.decision.searched == SMALL.golden["action"][0]
     labels, now = looked.maps.labels, seen[1]
     entry = small_decider().contract.grid.labels

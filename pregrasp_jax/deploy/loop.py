@@ -141,7 +141,7 @@ class Station:
         clock.lap("drawing")
         maps = to_maps(depth, cut, view=self.view, cell=self.cell)
         choose = None
-        if self.search is not None:
+        if self.search is not None and pushes < self.decider.contract.action.max_pushes:
             instances = self.view.cut(instance_image(masks))
             on_grid = self._instances(depth, cut, instances, target=target + 1, maps=maps)
             seen = Seen(maps.height_m, on_grid, target + 1, hand, joints, pushes)
