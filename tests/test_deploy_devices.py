@@ -169,6 +169,39 @@ def test_a_push_that_goes_wrong_ends_in_one_line(decider: Decider, controller: C
         arm.close()
 
 
+class Heard:
+    """What a client has heard from a controller that says something every 8 ms until `silent`, s."""
+
+    def __init__(self):
+        self.now, self.silent = 0.0, np.inf
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds
+
+    def getTimestamp(self) -> float:
+        return 100.0 + 0.008 * (min(self.now, self.silent) // 0.008)
+
+    def __getattr__(self, name: str) -> Any:
+        vectors = {"getActualTCPForce": 6, "getActualQ": 6, "getActualTCPPose": 6}
+        return lambda: np.zeros(vectors[name]) if name in vectors else name in ("getSafetyMode", "isConnected")
+
+
+def test_what_was_said_during_a_pause_is_no_news(decider: Decider, monkeypatch: pytest.MonkeyPatch):
+    from pregrasp_jax.deploy.drivers import ur
+
+    heard = Heard()
+    monkeypatch.setattr(ur.UrArm, "_connect", lambda self, *_: setattr(self, "_receive", heard))
+    monkeypatch.setattr(ur, "time", SimpleNamespace(sleep=heard.wait))
+    arm = ur.UrArm("", decider.body.arm, Limits(), speed=0.1, acceleration=0.5, clock=lambda: heard.now)
+    for pause in (0.02, 3.0):
+        heard.wait(pause)
+        assert arm.joints().shape == (6,) and arm.state().age_s < 0.02
+    heard.silent = heard.now + 0.05
+    heard.wait(5.0)
+    with pytest.raises(DeviceError, match=r"5\.\d+ s old"):
+        arm.joints()
+
+
 @GROUP
 @pytest.mark.parametrize(
     ("controller", "said"),
@@ -290,12 +323,42 @@ def test_pictures_are_taken_after_they_are_asked_for_and_masks_are_of_them(tmp_p
     threading.Timer(0.2, write).start()
     image, _, taken = source.capture()
     assert image[0, 0] == 2
-    segmenter = FileSegmenter(ids, min_score=0.5, patience_s=0.5)
+    segmenter = FileSegmenter(ids, min_score=0.5, fresh=False, patience_s=0.5)
     frame: Any = SimpleNamespace(time_s=taken)
     with pytest.raises(DeviceError, match=r"no new file of masks in .*ids\.png"):
         segmenter.segment(frame)
     os.utime(ids, (taken, taken))
     assert len(segmenter.segment(frame).masks) == 1
+
+
+def test_masks_of_an_image_from_before_the_arm_stood_still_are_not_taken(tmp_path):
+    """A network that takes 0.3 s an image: masks that it writes after the frame may be of an image from before."""
+    image, ids = tmp_path / "image.npy", tmp_path / "ids.png"
+    stop = threading.Event()
+
+    def show(objects: int) -> None:
+        np.save(tmp_path / "next.npy", np.arange(objects + 1, dtype=np.uint8)[None])
+        (tmp_path / "next.npy").replace(image)
+
+    def network() -> None:
+        while not stop.is_set():
+            seen = np.load(image)
+            time.sleep(0.3)
+            Image.fromarray(seen).save(tmp_path / "next.png")
+            (tmp_path / "next.png").replace(ids)
+
+    show(1)
+    thread = threading.Thread(target=network)
+    thread.start()
+    try:
+        time.sleep(0.45)  # its second image is under way
+        show(2)
+        frame: Any = SimpleNamespace(time_s=time.time())
+        assert len(FileSegmenter(ids, min_score=0.5, fresh=False).segment(frame).masks) == 1, "that is what can happen"
+        assert len(FileSegmenter(ids, min_score=0.5, fresh=True).segment(frame).masks) == 2
+    finally:
+        stop.set()
+        thread.join()
 
 
 @pytest.mark.parametrize("box", [((float("nan"), 0, 0), (1, 1, 1)), ((-9, -9, -9), (1, 1, 1)), ((0, 0, 0), (1, 0, 1))])

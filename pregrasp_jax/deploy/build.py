@@ -86,9 +86,9 @@ def make_station(
     view = view_of(cell, decider, folder)
     if not cell.camera.depth:
         raise ValueError("camera.depth is missing in cell.yaml; allowed is the file that the camera's driver writes")
-    source = FileSource(
-        folder / cell.camera.depth, folder / cell.camera.color if cell.camera.color else None, fresh=arm != "dry"
-    )
+    fresh = arm != "dry"
+    color = folder / cell.camera.color if cell.camera.color else None
+    source = FileSource(folder / cell.camera.depth, color, fresh=fresh)
     hand = _gripper(cell, gripper, say)
     try:
         return Station(
@@ -98,7 +98,7 @@ def make_station(
             say=say,
             view=view,
             source=source,
-            segmenter=_segmenter(cell, decider, view, folder),
+            segmenter=_segmenter(cell, decider, view, folder, fresh=fresh),
             target=target_of(cell),
             arm=_arm(cell, decider, arm, say),
             gripper=hand,
@@ -136,11 +136,11 @@ def _gripper(cell: Cell, kind: GripperKind, say: Say) -> GripperDriver:
     return Rg2(**dataclasses.asdict(cell.gripper))
 
 
-def _segmenter(cell: Cell, decider: Decider, view: View, folder: Path) -> Segmenter:
+def _segmenter(cell: Cell, decider: Decider, view: View, folder: Path, *, fresh: bool) -> Segmenter:
     settings = cell.segmenter
     if settings.kind == "tabletop":
         entry, scale = decider.contract.grid, cell.camera.depth_scale
         return TabletopSegmenter(view, decider.body, entry, scale=scale)
     if not settings.file:
         raise ValueError("segmenter.file is missing in cell.yaml; allowed is the .npz or .png that the network writes")
-    return FileSegmenter(folder / settings.file, min_score=settings.min_score)
+    return FileSegmenter(folder / settings.file, min_score=settings.min_score, fresh=fresh)

@@ -39,15 +39,33 @@ class FileSource:
 
 
 class FileSegmenter:
-    """Masks that a network writes beside the depth image."""
+    """Masks that a network keeps writing, one image after the other."""
 
-    def __init__(self, path: Path, *, min_score: float, patience_s: float = 5.0):
-        self._path, self._min_score, self._patience = path, min_score, patience_s
+    def __init__(self, path: Path, *, min_score: float, fresh: bool, patience_s: float = 5.0):
+        """Remember the file; it is read by `segment`.
+
+        Args:
+            path: .npz, or .png of instance ids.
+            min_score: of masks that count.
+            fresh: masks must be of an image that is no older than the one asked about: the arm may have moved before.
+                Otherwise any that are not older than it will do.
+            patience_s: how long masks are waited for, each time.
+        """
+        self._path, self._min_score, self._fresh, self._patience = path, min_score, fresh, patience_s
 
     def segment(self, frame: Frame) -> Masks:
-        """Return what the file holds once it is no older than the image; see `Segmenter.segment`."""
-        _wait(self._path, lambda written: written >= frame.time_s, "file of masks", self._patience)
+        """Return the masks of a frame; see `Segmenter.segment`.
+
+        A network that takes a second writes masks of an image that is a second old. So the first that are no older than
+        the frame may be of an earlier image; the next are not, for they were begun after the first were written.
+        """
+        first = self._wait(lambda written: written >= frame.time_s)
+        if self._fresh:
+            self._wait(lambda written: written > first)
         return read_masks(self._path, min_score=self._min_score)
+
+    def _wait(self, is_new: Callable[[float], bool]) -> float:
+        return _wait(self._path, is_new, "file of masks", self._patience)
 
 
 def _wait(path: Path, is_new: Callable[[float], bool], what: str, patience_s: float) -> float:

@@ -34,6 +34,9 @@ _ARRIVED = 0.002
 _PERIOD = 0.02
 """s between two looks at a moving arm."""
 
+_NEWS = 0.002
+"""s between two looks for new data; a controller sends 125 or 500 times a second."""
+
 _STALLED = 1.0
 """s without moving a millimetre on the way: stalled."""
 
@@ -76,6 +79,7 @@ class UrArm:
         self._speed, self._acceleration = speed, acceleration
         self._control, self._receive = None, None
         self._stamp, self._fresh = 0.0, clock()
+        self._asked = self._fresh
         try:
             self._connect(host, payload_kg)
         except BaseException:
@@ -115,11 +119,14 @@ class UrArm:
             raise DeviceError("the controller did not take the payload")
 
     def state(self) -> ArmState:
-        """Return what the controller says now."""
+        """Return what the controller says now. After a pause the next that it says is waited for, as long as it may."""
         receive = self._link()
+        if self._clock() - self._asked > self._limits.age_s:
+            self._wait_for_news()
         stamp, now = receive.getTimestamp(), self._clock()
         if stamp != self._stamp:
             self._stamp, self._fresh = stamp, now
+        self._asked = now
         force = np.asarray(receive.getActualTCPForce(), float)
         return ArmState(
             age_s=now - self._fresh,
@@ -237,6 +244,12 @@ class UrArm:
             if self._clock() - begun > _FIRST_DATA:
                 raise DeviceError(f"the controller has said nothing for {_FIRST_DATA:g} s")
             time.sleep(_PERIOD)
+
+    def _wait_for_news(self) -> None:
+        """Wait for data that come from now on: what has come since the last look may be as old as that."""
+        begun, self._stamp = self._clock(), self._link().getTimestamp()
+        while self._link().getTimestamp() == self._stamp and self._clock() - begun <= self._limits.age_s:
+            time.sleep(_NEWS)
 
     def _link(self) -> Any:
         if self._receive is None:
