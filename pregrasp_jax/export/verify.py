@@ -134,9 +134,6 @@ def _safetensors(bundle: Bundle, golden: Golden) -> np.ndarray:
 
 
 def _stablehlo(bundle: Bundle, golden: Golden) -> np.ndarray:
-    import pregrasp_jax  # noqa: F401  (before jax)
-
-    # isort: split
     from jax import export
 
     program = export.deserialize(bytearray(bundle.files[STABLEHLO]))
