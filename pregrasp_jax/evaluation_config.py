@@ -3,9 +3,20 @@
 The docstring under a field is its command-line help, as in `config`.
 """
 
+import dataclasses
 from dataclasses import dataclass, field
+from typing import Any
 
-from pregrasp_jax.config import AssetsConfig, CameraName, FreeSpace, PhysicsConfig, PlaceConfig, SceneConfig
+from pregrasp_jax.config import (
+    AssetsConfig,
+    CameraName,
+    Config,
+    FreeSpace,
+    PhysicsConfig,
+    PlaceConfig,
+    SceneConfig,
+    TaskConfig,
+)
 from pregrasp_jax.settings import check_ranges
 
 
@@ -120,6 +131,60 @@ def refuse_planning(plan: bool, planning: PlanningConfig) -> None:
     if not plan and planning != PlanningConfig():
         raise ValueError("planning.* is set, but plan = False; allowed is plan = True with it")
     planning.validate()
+
+
+def environment_config(request: EvaluationConfig, trained: Config) -> Config:
+    """Return the configuration of a policy with everything replaced that an evaluation decides.
+
+    Raises:
+        ValueError: out of range, or a contradiction; one line says what.
+    """
+    if trained.network.architecture == "compact" and (request.task.r_out or 0.0) > trained.task.r_out:
+        raise ValueError(
+            f"task.r_out = {request.task.r_out} is out of range; allowed for this policy, whose network values no "
+            f"longer pushes, is {trained.task.r_in} to {trained.task.r_out}"
+        )
+    scenes, default = request.scene.test_scenes, SceneConfig().test_scenes
+    if scenes < request.episodes and scenes != default:
+        raise ValueError(
+            f"scene.test_scenes = {scenes} are fewer than episodes = {request.episodes}; allowed is as many and more"
+        )
+    config = dataclasses.replace(
+        trained,
+        seed=request.seed,
+        assets=request.assets,
+        scene=dataclasses.replace(request.scene, test_scenes=max(scenes, request.episodes)),
+        physics=request.physics,
+        task=_task(trained.task, request.task),
+        strokes=dataclasses.replace(trained.strokes, **given(request.strokes)),
+    )
+    return config.validate()
+
+
+def refuse_other_hand(config: Config, trained: Config) -> None:
+    """Refuse a robot or a primitive that a policy was not trained with.
+
+    Raises:
+        ValueError: one line says which.
+    """
+    for name in ("robot", "primitive"):
+        asked, known = getattr(config.task, name), getattr(trained.task, name)
+        if asked != known:
+            raise ValueError(
+                f"task.{name} = {asked!r}: the policy was trained with {known!r}, which is what is allowed"
+            )
+
+
+def given(overrides: TaskOverrides | PlaceConfig | StrokesOverrides) -> dict[str, Any]:
+    """Return what is to be changed, by name."""
+    return {key: value for key, value in vars(overrides).items() if value is not None}
+
+
+def _task(trained: TaskConfig, overrides: TaskOverrides) -> TaskConfig:
+    """Return the task of a policy, changed; another place has dimensions of its own."""
+    elsewhere = overrides.workspace not in (None, trained.workspace)
+    place = dataclasses.replace(PlaceConfig() if elsewhere else trained.place, **given(overrides.place))
+    return dataclasses.replace(trained, **given(overrides) | {"place": place})
 
 
 _PLANNING_RANGES: dict[str, tuple[float, float]] = {

@@ -113,6 +113,21 @@ SENSORS: dict[str, Sensor] = {
 """Sensors by the name that `task.sensor` knows them by. Source of baselines and noise: Intel's tuning paper."""
 
 
+def camera_sensor(name: str, camera: str) -> Sensor:
+    """Return the sensor called `name` (see `get_sensor`) of a camera.
+
+    Raises:
+        ValueError: as `get_sensor`, or the camera has no use for it.
+    """
+    sensor = get_sensor(name)
+    if sensor != CLEAN and camera != "pinhole":
+        raise ValueError(
+            f"task.sensor = {name!r} is what a pinhole camera gets wrong, but task.camera = {camera!r}; allowed with "
+            "it is pinhole"
+        )
+    return sensor
+
+
 def get_sensor(name: str) -> Sensor:
     """Return the sensor called `name`, or that of a YAML file, in which `base` names the one it starts from.
 

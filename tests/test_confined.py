@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from pregrasp_jax.config import Config, NetworkConfig, PlaceConfig, TaskConfig
-from pregrasp_jax.evaluation.player import _task
-from pregrasp_jax.evaluation_config import TaskOverrides
+from pregrasp_jax.evaluation_config import TaskOverrides, _task
 from pregrasp_jax.robot import clearance, get_robot
 from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.robot.description import arm

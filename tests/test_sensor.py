@@ -13,11 +13,9 @@ from heightmap_oracle import box_cloud, make_instances
 from pregrasp_jax import heightmap
 from pregrasp_jax.assets import spread
 from pregrasp_jax.assets.catalogue import builtin_bank
-from pregrasp_jax.config import Config, TaskConfig
 from pregrasp_jax.heightmap import sensor
 from pregrasp_jax.heightmap.views import project_upward
-from pregrasp_jax.sensors import SENSORS, Sensor, get_sensor
-from pregrasp_jax.task.assembly import sensor_of
+from pregrasp_jax.sensors import SENSORS, Sensor, camera_sensor, get_sensor
 from pregrasp_jax.types import ROBOT_ID
 
 KEY = jax.random.key(0)
@@ -42,8 +40,8 @@ def test_names_and_files(tmp_path: Path):
     with pytest.raises(ValueError, match=r"allowed: clean, d435, d455, or a \.yaml file"):
         get_sensor("kinect")
     with pytest.raises(ValueError, match="allowed with it is pinhole"):
-        sensor_of(TaskConfig(sensor="d435"))
-    assert sensor_of(Config(task=TaskConfig(sensor="d435", camera="pinhole")).validate().task) == SENSORS["d435"]
+        camera_sensor("d435", "orthographic")
+    assert camera_sensor("d435", "pinhole") == SENSORS["d435"]
 
 
 @pytest.mark.parametrize("cell", ["max", "second", "median"])

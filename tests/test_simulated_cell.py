@@ -10,8 +10,7 @@ from pregrasp_jax import simulated_cell
 from pregrasp_jax.config import AssetsConfig, Config, NetworkConfig, PhysicsConfig, SceneConfig, TaskConfig
 from pregrasp_jax.deploy.bundle import read_bundle
 from pregrasp_jax.deploy.cell import Cell, SimSettings
-from pregrasp_jax.evaluation import player
-from pregrasp_jax.evaluation_config import EvaluationConfig, TaskOverrides
+from pregrasp_jax.evaluation_config import EvaluationConfig, TaskOverrides, environment_config
 from pregrasp_jax.export.bundle import export_policy
 
 
@@ -49,7 +48,7 @@ def test_objects_and_scenes_are_those_of_an_evaluation(scene, tmp_path: Path, mo
         task=TaskOverrides(camera="pinhole", sensor="d455"),
         episodes=scene + 1,
     )
-    wanted = player._environment_config(request, trained)
+    wanted = environment_config(request, trained)
     assert split == "test"
     for name in ("task", "assets", "scene", "physics"):
         assert getattr(found, name) == getattr(wanted, name), name

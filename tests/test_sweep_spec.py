@@ -1,6 +1,7 @@
 """What is refused before a sweep starts, in one line; which settings there are; what becomes of them, as a function."""
 
 import dataclasses
+import math
 import random
 import re
 import sys
@@ -58,6 +59,7 @@ VARIANTS = {"parameters": None, "search": None, "stop": None, "final": None}
         ({"stop": {"rungs": [2000.5]}}, "stop.rungs = [2000.5] is no list of whole numbers"),
         ({"seeds": [1, 1]}, "seeds = [1, 1] has a number twice"),
         ({"seeds": []}, "seeds is empty"),
+        ({"seeds": [0, 2**32]}, "seeds has 4294967296, which is out of range; allowed is 0 to 4294967295"),
         ({"set": {"train.envsteps": 3}}, "this version knows no setting train.envsteps; allowed here: "),
         ({"set": {**FULL["set"], "train": 3}}, "this version knows no setting train;"),
         ({"set": {**FULL["set"], "learner.discount": "high"}}, "learner.discount = 'high' has the wrong type"),
@@ -85,6 +87,7 @@ VARIANTS = {"parameters": None, "search": None, "stop": None, "final": None}
         ({"stop": {"method": "halving", "rungs": [2000, 8000]}}, "halving needs train.env_steps above that"),
         ({"stop": {"method": "halving", "rungs": [2000], "keep": 1.0}}, "stop.keep = 1.0 is out of range"),
         ({"stop": {"rungs": [2000]}}, "stop.rungs belong to stop.method halving"),
+        ({"stop": {"keep": 0.25}}, "stop.keep belongs to stop.method halving"),
         ({"stop": {"metric": "train/loss"}}, "stop.metric = 'train/loss' is not of validation scenes"),
         ({"stop": {"metric": "eval/succes_rate"}}, "stop.metric = 'eval/succes_rate' is not known; allowed: eval/succ"),
         ({"set": {"train.evaluate_every": 2000, "train.minutes": 0}, "parameters": {
@@ -93,6 +96,13 @@ VARIANTS = {"parameters": None, "search": None, "stop": None, "final": None}
         ({"resources": {"cores": 0}}, "resources.cores = 0 is out of range"),
         ({"resources": {"gpu": 1.5}}, "resources.gpu = 1.5 is out of range"),
         ({"resources": {"memory_gb": 0}}, "resources.memory_gb = 0.0 is out of range"),
+        ({"resources": {"gpu": math.nan}}, "resources.gpu = nan is out of range"),
+        ({"resources": {"memory_gb": math.nan}}, "resources.memory_gb = nan is out of range"),
+        ({"program": ["nosuchprogram", "x.py"]}, "'nosuchprogram' is not found; allowed is one that can be run"),
+        ({"final": {"top": 2}}, "final has no seeds, so nothing is trained again"),
+        ({"final": {"seeds": [2**32]}}, "final.seeds has 4294967296, which is out of range"),
+        ({**VARIANTS, "variants": {"a": {}, "b": {"policy": "clear"}}, "final": {"seeds": [9], "top": 2}},
+         "final.top = 2, but 1 settings are trained; allowed is at most that"),
         ({"final": {"seeds": [1, 12]}}, "final.seeds has 1, with which settings were chosen"),
         ({"final": {"seeds": [10], "top": 0}}, "final.top = 0 is out of range"),
         ({"tests": {"far": {"camera": "pinhole"}}}, "tests.far: this version's evaluate knows no camera"),
@@ -100,8 +110,14 @@ VARIANTS = {"parameters": None, "search": None, "stop": None, "final": None}
         ({"tests": {"far": {"episodes.foo": 3}}}, "tests.far: this version's evaluate knows no episodes.foo"),
         ({"tests": {"far": {"planning": {"depth": 1}}}}, "tests.far: this version's evaluate knows no planning;"),
         ({"tests": {"far": {"episodes": 0}}}, "tests.far: episodes = 0 is out of range; allowed is 1 and more"),
+        ({"tests": {"../far": {"episodes": 3}}}, "tests has '../far', which is to name a file"),
+        ({"tests": {"far": {"task.r_out": -2.0}}}, "tests.far: task.r_out = -2.0 is out of range"),
+        ({"tests": {"far": {"task.sensor": "d455"}}}, "tests.far: task.sensor = 'd455' is what a pinhole"),
+        ({"tests": {"far": {"task.place.half_width": 0.3}}}, "tests.far: task.place.half_width"),
+        ({"tests": {"far": {"task.robot": "barrett"}}}, "tests.far: task.robot = 'barrett': the policy was trained"),
+        ({"tests": {"far": {"scene.test_scenes": 5, "episodes": 6}}}, "tests.far: scene.test_scenes = 5 are fewer"),
         ({"tests": {"far": {"planning.depth": 1}}}, "tests.far: planning.* is set, but plan = False"),
-        ({"tests": {"far": {"assets.object_dir": "nowhere"}}}, "tests.far.assets.object_dir = 'nowhere' is no folder"),
+        ({"tests": {"far": {"assets.object_dir": "nowhere"}}}, "tests.far: assets.object_dir = 'nowhere' is no folder"),
         ({"tests": {"far": {"policy": "pin"}}}, "tests.far.policy is decided by the trial"),
         ({**VARIANTS, "variants": {"shelf": {"task.shelf": 1}}}, "this version knows no setting task.shelf"),
         ({**VARIANTS, "variants": {"a": {"policy": "clear", "task.r_out": 1}}}, "variants.a names a policy"),
@@ -124,6 +140,32 @@ def test_what_is_wrong_is_one_line(keys, said, tmp_path, capsys):
     error = capsys.readouterr().err
     assert exit_info.value.code == 2 and said in error and len(error.splitlines()) == 1
     assert not (tmp_path / "sweep").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--parallel", "0"], "parallel = 0 is out of range; allowed is 1 and more"),
+        (["--parallel", "-1"], "parallel = -1 is out of range"),
+    ],
+)
+def test_options_that_cannot_be_are_one_line(options, said, tmp_path, capsys):
+    (tmp_path / "spec.yaml").write_text("preset: ci\n")
+    for command in (
+        ["sweep", "start", str(tmp_path / "spec.yaml"), "--dir", str(tmp_path / "x")],
+        ["reproduce", "table2"],
+    ):
+        with pytest.raises(SystemExit) as exit_info:
+            main([*command, "--dry-run", "True", *options])
+        assert exit_info.value.code == 2 and said in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_is_refused_by_a_dry_run(tmp_path, capsys):
+    (tmp_path / "spec.yaml").write_text("preset: ci\n")
+    with pytest.raises(SystemExit) as exit_info:
+        inside = tmp_path / "spec.yaml" / "sweep"
+        main(["sweep", "start", str(tmp_path / "spec.yaml"), "--dir", str(inside), "--dry-run", "True"])
+    assert exit_info.value.code == 2 and "cannot be written" in capsys.readouterr().err
 
 
 def test_a_key_that_stands_twice_is_refused_with_its_line(tmp_path, capsys):

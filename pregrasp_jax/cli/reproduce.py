@@ -51,7 +51,7 @@ def reproduce(
         seeds: of every row; the experiment's own if left out.
         object_dir: folder of your meshes, for one more test.
         dry_run: check everything, say what would be done, and do nothing.
-        only_page: write the page of what there is.
+        only_page: write the page of what there is, and do nothing else.
     """
     experiment = experiments.read_experiment(name)
     resources = {"cores": cores, "memory_gb": memory_gb, "gpu": gpu}
@@ -61,8 +61,11 @@ def reproduce(
     )
     path = dir or Path("runs/reproduce") / (experiment.runs if size == "budget" else f"{experiment.runs}-{size}")
     if only_page:
+        others = (budget, env_steps, launcher, parallel, cores, memory_gb, gpu, seeds, object_dir, dry_run)
+        if others != (None, None, "local", None, 1, None, 0.0, None, None, False):
+            raise ValueError("only_page = True writes the page of what there is; allowed beside it: --dir and --size")
         return _write_page(path, experiment)
-    check(spec, launcher=launcher, names=dry_run)
+    check(spec, launcher=launcher, parallel=parallel, names=dry_run)
     for line in describe(spec, launcher=launcher, parallel=parallel):
         print(line, flush=True)
     if dry_run:

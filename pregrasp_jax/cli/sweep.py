@@ -49,7 +49,7 @@ def start(
         dry_run: check everything, say what would be done, and do nothing.
     """
     read = read_spec(spec)
-    check(read, launcher=launcher, names=dry_run)
+    check(read, launcher=launcher, parallel=parallel, names=dry_run)
     SweepFolder.refuse_used(dir)
     for line in describe(read, launcher=launcher, parallel=parallel):
         print(line, flush=True)
@@ -71,7 +71,7 @@ def resume(
     """
     opened = SweepFolder.open(folder)
     spec = opened.spec()
-    check(spec, launcher=launcher, here=opened.cwd)
+    check(spec, launcher=launcher, parallel=parallel, here=opened.cwd)
     with opened.drive():  # what another driver was asked to do is not taken back
         opened.ask_to_stop(False)
         for failed in [s for s in opened.states() if retry and s.failed]:
@@ -168,18 +168,23 @@ def worker(
     return code
 
 
-def check(spec: Spec, *, launcher: LauncherName, names: bool = False, here: Path = Path()) -> None:
+def check(
+    spec: Spec, *, launcher: LauncherName, parallel: int | None, names: bool = False, here: Path = Path()
+) -> None:
     """Refuse what cannot work, before anything is written.
 
     Args:
         spec: of the sweep.
         launcher: its own needs are looked at, too.
+        parallel: trials at a time, None for as many as fit.
         names: whether to check those that only the registries know, which takes JAX.
         here: folder that relative paths refer to.
 
     Raises:
         ValueError: one line says what, where, and what is allowed.
     """
+    if parallel is not None and parallel < 1:
+        raise ValueError(f"parallel = {parallel} is out of range; allowed is 1 and more")
     checks.check(spec, here=here)
     if spec.search.method == "tpe":
         require_optuna()

@@ -12,9 +12,9 @@ import jax
 
 from pregrasp_jax.checkpoint import TrainedPolicy, load_policy
 from pregrasp_jax.checkpoint.policy import PPG
-from pregrasp_jax.config import PUSHING, STYLES, Config, PlaceConfig, TaskConfig, with_absolute_paths
+from pregrasp_jax.config import PUSHING, STYLES, Config, with_absolute_paths
 from pregrasp_jax.evaluation import EpisodeCallback, Evaluator, evaluation_document, learned
-from pregrasp_jax.evaluation_config import EvaluationConfig, StrokesOverrides, TaskOverrides
+from pregrasp_jax.evaluation_config import EvaluationConfig, environment_config, given, refuse_other_hand
 from pregrasp_jax.machine import announced_compilation
 from pregrasp_jax.planning.planner import Planner
 from pregrasp_jax.policies import scripts
@@ -69,9 +69,9 @@ def make_player(request: EvaluationConfig, *, say: Callable[[str], None] = print
     _check_deciders(request, trained)
     request.validate()
     _check_strokes(request)
-    config = _environment_config(request, Config() if trained is None else trained.config)
+    config = environment_config(request, Config() if trained is None else trained.config)
     if trained is not None:
-        _refuse_other_hand(config, trained.config)
+        refuse_other_hand(config, trained.config)
         folders = [with_absolute_paths(made).assets.object_dir for made in (trained.config, config)]
         if folders[0] != folders[1]:
             names = (folder or "the built-in objects" for folder in folders)
@@ -156,10 +156,10 @@ def _check_deciders(request: EvaluationConfig, trained: TrainedPolicy | None) ->
 
 def _check_strokes(request: EvaluationConfig) -> None:
     """Refuse settings of Target-PPG for a policy that has no use for them."""
-    given, random = _given(request.strokes), request.policy in STROKE_SCRIPTS
-    if given and request.policy != "target-strokes" and _named(request.policy)[1] != "target-ppg":
+    asked, random = given(request.strokes), request.policy in STROKE_SCRIPTS
+    if asked and request.policy != "target-strokes" and _named(request.policy)[1] != "target-ppg":
         raise ValueError(
-            f"strokes.{next(iter(given))} is about Target-PPG, not about policy {request.policy}; allowed with it: "
+            f"strokes.{next(iter(asked))} is about Target-PPG, not about policy {request.policy}; allowed with it: "
             "target-ppg, target-ppg:FOLDER, target-strokes"
         )
     if random and request.strokes.mask_radius:
@@ -188,48 +188,6 @@ def refuse_unknown_policy(spec: str, *, key: str) -> None:
     names = [*scripts.SCRIPTS, *STROKE_SCRIPTS, *PUSHING, *STYLES]
     if spec not in names and not Path(_named(spec)[0]).exists():
         raise ValueError(f"{key} {spec} does not exist; allowed: {', '.join(names)}, or a run folder")
-
-
-def _environment_config(request: EvaluationConfig, trained: Config) -> Config:
-    """Return the configuration of the policy with everything replaced that the request decides."""
-    if trained.network.architecture == "compact" and (request.task.r_out or 0.0) > trained.task.r_out:
-        raise ValueError(
-            f"task.r_out = {request.task.r_out} is out of range; allowed for this policy, whose network values no "
-            f"longer pushes, is {trained.task.r_in} to {trained.task.r_out}"
-        )
-    test_scenes = max(request.scene.test_scenes, request.episodes)
-    config = dataclasses.replace(
-        trained,
-        seed=request.seed,
-        assets=request.assets,
-        scene=dataclasses.replace(request.scene, test_scenes=test_scenes),
-        physics=request.physics,
-        task=_task(trained.task, request.task),
-        strokes=dataclasses.replace(trained.strokes, **_given(request.strokes)),
-    )
-    return config.validate()
-
-
-def _refuse_other_hand(config: Config, trained: Config) -> None:
-    """Refuse a robot or a primitive that a policy was not trained with."""
-    for name in ("robot", "primitive"):
-        asked, known = getattr(config.task, name), getattr(trained.task, name)
-        if asked != known:
-            raise ValueError(
-                f"task.{name} = {asked!r}: the policy was trained with {known!r}, which is what is allowed"
-            )
-
-
-def _task(trained: TaskConfig, overrides: TaskOverrides) -> TaskConfig:
-    """Return the task of a policy, changed; another place has dimensions of its own."""
-    elsewhere = overrides.workspace not in (None, trained.workspace)
-    place = dataclasses.replace(PlaceConfig() if elsewhere else trained.place, **_given(overrides.place))
-    return dataclasses.replace(trained, **_given(overrides) | {"place": place})
-
-
-def _given(overrides: TaskOverrides | PlaceConfig | StrokesOverrides) -> dict[str, Any]:
-    """Return what is to be changed."""
-    return {key: value for key, value in vars(overrides).items() if value is not None}
 
 
 def _make_script(name: str, env: Env, config: Config) -> Policy:

@@ -1,17 +1,22 @@
 """Everything that can be known to be wrong before the first trial starts, one line each."""
 
+import dataclasses
 import itertools
-from collections.abc import Iterator, Mapping
+import math
+import re
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pregrasp_jax.config import PUSHING
-from pregrasp_jax.evaluation_config import EvaluationConfig
-from pregrasp_jax.sensors import SENSORS, get_sensor
+from pregrasp_jax.config import PUSHING, Config
+from pregrasp_jax.evaluation_config import EvaluationConfig, environment_config, refuse_other_hand
+from pregrasp_jax.ranges import RANGES
+from pregrasp_jax.sensors import SENSORS, camera_sensor
 from pregrasp_jax.settings import from_dict, to_dict
-from pregrasp_jax.spaces.workspace import WORKSPACES, get_workspace
+from pregrasp_jax.spaces.workspace import get_workspace
 from pregrasp_jax.sweep import parameters
-from pregrasp_jax.sweep.spec import PROGRAM, Spec, Variant
+from pregrasp_jax.sweep.spec import PROGRAM, Final, Spec, Stop, Variant
 from pregrasp_jax.sweep.trials import trial_config
 
 GIVEN = {"seed": "seeds", "physics.threads": "resources.cores"}
@@ -19,6 +24,9 @@ GIVEN = {"seed": "seeds", "physics.threads": "resources.cores"}
 
 METRICS = ("success_rate", "in_region_rate", "lenient_rate", "mean_return")
 """What trainings measure on validation scenes of which more is better."""
+
+_TEST_NAME = re.compile(r"[^/.\0][^/\0]{0,99}")
+"""It becomes part of the name of a file."""
 
 LIMITS = ("train.env_steps", "train.episodes", "train.minutes")
 
@@ -50,7 +58,8 @@ def check(spec: Spec, *, here: Path = Path()) -> None:
     Raises:
         ValueError: one line says what, where, and what is allowed.
     """
-    for problem in itertools.chain(_search(spec), _names(spec, here), _stop(spec), _resources(spec), _final(spec)):
+    problems = (_search(spec), _names(spec, here), _stop(spec), _resources(spec), _final(spec), _program(spec, here))
+    for problem in itertools.chain(*problems):
         raise ValueError(problem)
     for varied, about in settings_to_check(spec):
         if about.get("policy") is None:
@@ -79,6 +88,7 @@ def _search(spec: Spec) -> Iterator[str]:
     search = spec.search
     if not spec.seeds:
         yield "seeds is empty; allowed is a list such as [0, 1]"
+    yield from _seeds("seeds", spec.seeds)
     if spec.variants and (spec.parameters or search.method != "grid"):
         yield "variants are not searched; allowed is either variants, or parameters and search"
     if search.method == "grid" and search.trials is not None:
@@ -121,6 +131,8 @@ def _stop(spec: Spec) -> Iterator[str]:
     if stop.method == "none":
         if stop.rungs:
             yield "stop.rungs belong to stop.method halving"
+        if stop.keep != Stop().keep:
+            yield "stop.keep belongs to stop.method halving"
         return
     if not stop.rungs or list(stop.rungs) != sorted(stop.rungs) or stop.rungs[0] < 1:
         yield f"stop.rungs = {list(stop.rungs)} must be env steps above 0 in ascending order, one and more"
@@ -141,9 +153,9 @@ def _resources(spec: Spec) -> Iterator[str]:
     resources = spec.resources
     if resources.cores < 1:
         yield f"resources.cores = {resources.cores} is out of range; allowed is 1 and more"
-    if resources.memory_gb is not None and resources.memory_gb <= 0:
+    if resources.memory_gb is not None and not 0 < resources.memory_gb < math.inf:
         yield f"resources.memory_gb = {resources.memory_gb} is out of range; allowed is above 0, or null"
-    if resources.gpu < 0 or (resources.gpu > 1 and not resources.gpu.is_integer()):
+    if not 0 <= resources.gpu < math.inf or (resources.gpu > 1 and not resources.gpu.is_integer()):
         yield f"resources.gpu = {resources.gpu} is out of range; allowed is a share up to 1, or a whole number"
 
 
@@ -154,13 +166,29 @@ def _final(spec: Spec) -> Iterator[str]:
     for name in ("top", "episodes"):
         if getattr(final, name) < 1:
             yield f"final.{name} = {getattr(final, name)} is out of range; allowed is 1 and more"
+    if not final.seeds and final != Final():
+        yield "final has no seeds, so nothing is trained again; allowed beside that is nothing"
+    yield from _seeds("final.seeds", final.seeds)
+    trained = num_settings(spec) - sum(variant.policy is not None for variant in spec.variants.values())
+    if final.seeds and final.top > trained:
+        yield f"final.top = {final.top}, but {trained} settings are trained; allowed is at most that"
+
+
+def _seeds(key: str, seeds: Sequence[int]) -> Iterator[str]:
+    low, high = RANGES["seed"]
+    if wrong := [seed for seed in seeds if not low <= seed <= high]:
+        yield f"{key} has {wrong[0]}, which is out of range; allowed is {low} to {high}"
+
+
+def _program(spec: Spec, here: Path) -> Iterator[str]:
+    name = spec.program[0] if spec.program else ""
+    if not (shutil.which(name) or shutil.which(here / name)):
+        yield f"program = {list(spec.program)}: {name!r} is not found; allowed is one that can be run, with its options"
 
 
 def _check_setting(spec: Spec, varied: Mapping[str, Any], here: Path) -> None:
     config = trial_config(spec, {**spec.set, **varied})
-    if spec.program == PROGRAM:  # another program may bring places of its own
-        get_workspace(config.task.workspace)
-        _check_files(config.assets.object_dir, config.task.sensor, here, where="")
+    _check_places(spec, config, here)
     if spec.stop.method == "none":
         return
     every, rungs = config.train.evaluate_every, spec.stop.rungs
@@ -175,16 +203,22 @@ def _check_setting(spec: Spec, varied: Mapping[str, Any], here: Path) -> None:
         )
 
 
-def _check_files(object_dir: str | None, sensor: str | None, here: Path, *, where: str) -> None:
-    """Refuse meshes and sensors that are not there; `where` precedes the names of the settings."""
-    if object_dir is not None and not (here / object_dir).is_dir():
-        raise ValueError(f"{where}assets.object_dir = {object_dir!r} is no folder; allowed is one with meshes")
-    if sensor is not None:
-        get_sensor(sensor if sensor in SENSORS else str(here / sensor))
+def _check_places(spec: Spec, config: Config, here: Path) -> None:
+    """Refuse meshes, sensors and places that are not there, or not for this task."""
+    folder, sensor = config.assets.object_dir, config.task.sensor
+    if folder is not None and not (here / folder).is_dir():
+        raise ValueError(f"assets.object_dir = {folder!r} is no folder; allowed is one with meshes")
+    camera_sensor(sensor if sensor in SENSORS else str(here / sensor), config.task.camera)
+    if spec.program == PROGRAM:  # another program may bring places of its own
+        get_workspace(config.task.workspace, dataclasses.asdict(config.task.place))
 
 
 def _check_test(spec: Spec, name: str, options: Mapping[str, Any], here: Path) -> None:
     """Refuse options that `evaluate` does not have or refuses, and places that are not there."""
+    if not _TEST_NAME.fullmatch(name):
+        raise ValueError(
+            f"tests has {name!r}, which is to name a file; allowed is a short name without / and a dot at its start"
+        )
     values = to_dict(EvaluationConfig(policy=""))
     for key, value in options.items():
         if key in ("policy", "physics.threads"):
@@ -200,11 +234,14 @@ def _check_test(spec: Spec, name: str, options: Mapping[str, Any], here: Path) -
     checked = from_dict(values, EvaluationConfig, f"tests.{name}.")
     try:
         checked.validate()
+        for varied, about in settings_to_check(spec):
+            if about.get("policy") is None:
+                trained = trial_config(spec, {**spec.set, **varied})
+                tested = environment_config(checked, trained)
+                refuse_other_hand(tested, trained)
+                _check_places(spec, tested, here)
     except ValueError as error:
         raise ValueError(f"tests.{name}: {error}") from None
-    _check_files(checked.assets.object_dir, checked.task.sensor, here, where=f"tests.{name}.")
-    if spec.program == PROGRAM and checked.task.workspace not in (None, *WORKSPACES):
-        get_workspace(checked.task.workspace)
 
 
 def _different(spec: Spec) -> list[dict[str, Any]]:

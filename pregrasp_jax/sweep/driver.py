@@ -46,7 +46,7 @@ class Driver:
         """
         self.folder, self.spec, self.launcher, self.say = folder, spec, launcher, say
         self._study = Study(folder.path, spec) if spec.search.method == "tpe" else None
-        self._submitted: set[str] = set()
+        self._submitted: dict[str, int] = {}  # trial id -> how often it had ended
         self._lost: Counter[str] = Counter()
         self._signal = 0
         self._said = 0.0
@@ -75,9 +75,9 @@ class Driver:
             jobs = [job for job in self._jobs(states) if job.trial.id not in self._submitted]
             others = {job.trial.id for job in jobs if self.folder.is_running(job.trial)}
             ready = [job for job in jobs if job.trial.id not in others]
-            room = self._room(len(others), states)
+            room, endings = self._room(len(others), states), {s.trial.id: s.endings for s in states}
             for job in ready[:room]:
-                self._submitted.add(job.trial.id)
+                self._submitted[job.trial.id] = endings[job.trial.id]
                 self.launcher.submit(job)
             idle = room - len(ready)
             if idle > 0 and self._propose(states):
@@ -101,14 +101,14 @@ class Driver:
         ended = self.launcher.ended()
         states = self.folder.states()
         for trial_id, code in ended:
-            self._submitted.discard(trial_id)
             self._note_lost(trial_id, code, states)
         self._tell(states, ended=bool(ended))
         return states
 
     def _note_lost(self, trial_id: str, code: int, states: Sequence[TrialState]) -> None:
         """Give up where workers end again and again without writing anything down."""
-        spoke = code in (0, 1, 2, BUSY) or (code == 143 and self._signal)
+        before, now = self._submitted.pop(trial_id), next(s.endings for s in states if s.trial.id == trial_id)
+        spoke = now > before or code in (0, BUSY) or (code == 143 and self._signal)
         self._lost[trial_id] = 0 if spoke else self._lost[trial_id] + 1
         if code == UNWRITTEN and self._lost[trial_id] > 1:
             raise ValueError(
@@ -146,7 +146,7 @@ class Driver:
         self.launcher.stop()
         while self._submitted:
             for trial_id, _ in self.launcher.ended():
-                self._submitted.discard(trial_id)
+                self._submitted.pop(trial_id)
             time.sleep(POLL)
         self.say(f"stopped; `{command('sweep', 'resume', self.folder.path)}` goes on")
         return 128 + (self._signal or signal.SIGTERM)

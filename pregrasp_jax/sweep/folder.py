@@ -45,12 +45,13 @@ class SweepFolder:
         """Refuse a folder that no sweep can begin in.
 
         Raises:
-            ValueError: it holds something.
+            ValueError: it holds something, or cannot be written.
         """
         if (path / SPEC).exists():
             raise ValueError(f"{path} already holds a sweep; go on with `{command('sweep', 'resume', path)}`")
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             raise ValueError(f"{path} is not empty and holds no sweep; allowed is a new or empty folder")
+        io.refuse_unwritable(path / SPEC)
 
     @classmethod
     def create(cls, path: Path, spec: Spec) -> "SweepFolder":
@@ -60,7 +61,6 @@ class SweepFolder:
             ValueError: the folder holds something, or cannot be written.
         """
         cls.refuse_used(path)
-        io.refuse_unwritable(path / SPEC)
         folder = cls(path)
         for name in ("runs", "logs", "locks"):
             (folder.path / name).mkdir(parents=True, exist_ok=True)
@@ -85,7 +85,11 @@ class SweepFolder:
         Raises:
             ValueError: it is damaged, or edited where it must not be.
         """
-        spec, first = read_spec(self.path / SPEC), spec_from(self._first()["spec"])
+        spec, begun = read_spec(self.path / SPEC), self._first()["spec"]
+        try:
+            first = spec_from(begun)
+        except ValueError as error:
+            raise ValueError(f"{self.path / TRIALS}: {error}") from None
         for key in to_plain(spec).keys() | to_plain(first).keys():
             if key not in CHANGEABLE and getattr(spec, key) != getattr(first, key):
                 raise ValueError(
@@ -218,10 +222,11 @@ class SweepFolder:
             (self.path / STOP).unlink(missing_ok=True)
 
     def _first(self) -> Record:
-        events = self.events()
-        if not events or events[0].get("event") != "sweep":
+        first = next(iter(self.events()), None)
+        kinds = {"event": str, "spec": dict, "cwd": str}
+        if not isinstance(first, dict) or any(not isinstance(first.get(key), kind) for key, kind in kinds.items()):
             raise ValueError(f"{self.path / TRIALS} is damaged: it does not begin with the sweep's settings")
-        return events[0]
+        return first
 
     @contextmanager
     def _locked_file(self, name: str, *, patience: float = 0.0) -> Iterator[TextIO]:

@@ -33,6 +33,7 @@ class TrialState:
         seconds: wall-clock time of all sessions.
         message: what the last failure said.
         begun: whether a session has ever started.
+        endings: sessions whose end is known.
     """
 
     trial: Trial
@@ -45,6 +46,7 @@ class TrialState:
     seconds: float = 0.0
     message: str = ""
     begun: bool = False
+    endings: int = 0
 
     @property
     def over(self) -> bool:
@@ -98,6 +100,7 @@ def _take(states: dict[str, TrialState], event: Record) -> None:
 
 def _end(state: TrialState, event: Record) -> None:
     state.outcome = event["outcome"]
+    state.endings += 1
     state.failures = state.failures + 1 if state.outcome == FAILED else 0
     state.seconds += event["seconds"]
     state.message = event.get("message", "")

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, BinaryIO
 
 from pregrasp_jax.sweep import state
 from pregrasp_jax.sweep.folder import SweepFolder
@@ -68,6 +68,7 @@ class Worker:
         self.run_dir = folder.run(trial)
         self._cores = cores
         self._asked_to_stop = False
+        self._told = False
         self._lock_fd = -1
         self._size_seen = -1
 
@@ -112,15 +113,18 @@ class Worker:
                 ending = self._ended(self._call(evaluate_command(self.spec, self.trial, name, self.run_dir)))
                 if ending.outcome != state.DONE:
                     return ending
+                if not file.exists():
+                    return _Ending(state.FAILED, message=f"the test {name} has ended well, and not written {file}")
         return _Ending(state.DONE)
 
     def _train(self) -> _Ending:
         if self._at_rung():
             return _Ending(state.RUNG)
         code = self._call(train_command(self.spec, self.trial, self.run_dir), watched=True)
-        if code != 0 and not self._asked_to_stop and code in _SIGNALLED and self._at_rung():
+        stopped = code in _SIGNALLED or (self._told and code == 0)  # a program may not say that it was stopped
+        if stopped and not self._asked_to_stop and self._at_rung():
             return _Ending(state.RUNG, code)
-        return self._ended(code)
+        return _Ending(state.STOPPED, code) if stopped else self._ended(code)
 
     def _ended(self, code: int) -> _Ending:
         if code == 0:
@@ -132,26 +136,33 @@ class Worker:
     def _call(self, command: Sequence[str], *, watched: bool = False) -> int:
         """Run a command and return its exit code; ask it to stop once, at the rung or when this process is asked."""
         with self.folder.log(self.trial).open("ab") as log:
-            child = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                cwd=self.folder.cwd,
-                env=environment(os.environ, self.spec),
-                start_new_session=True,  # Ctrl-C is for the driver; a second signal would end a training at once
-                pass_fds=(self._lock_fd,),
-                preexec_fn=_die_with_parent if sys.platform == "linux" else None,
-            )
-            told = False
+            try:
+                child = self._open(command, log)
+            except OSError as error:
+                log.write(f"error: {command[0]} cannot be run ({error.strerror}); allowed is a program\n".encode())
+                return 2
+            self._told = False
             while (code := child.poll()) is None:
                 stop = self._asked_to_stop or self.folder.stopping or (watched and self._grown() and self._at_rung())
-                if stop and not told:
+                if stop and not self._told:
                     child.terminate()
-                    told = True
+                    self._told = True
                     self._asked_to_stop = self._asked_to_stop or self.folder.stopping
                 time.sleep(POLL)
         return code
+
+    def _open(self, command: Sequence[str], log: BinaryIO) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            cwd=self.folder.cwd,
+            env=environment(os.environ, self.spec),
+            start_new_session=True,  # Ctrl-C is for the driver; a second signal would end a training at once
+            pass_fds=(self._lock_fd,),
+            preexec_fn=_die_with_parent if sys.platform == "linux" else None,
+        )
 
     def _grown(self) -> bool:
         """Return whether there are new metrics since this was last asked."""

@@ -16,7 +16,7 @@ from pregrasp_jax.robot import closing_region, get_robot
 from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.scene import bank as scene_bank
 from pregrasp_jax.scene.bank import SPLITS, SceneBank, Split
-from pregrasp_jax.sensors import CLEAN, Sensor, get_sensor
+from pregrasp_jax.sensors import CLEAN, Sensor, camera_sensor
 from pregrasp_jax.spaces.workspace import Workspace
 from pregrasp_jax.task import registry
 from pregrasp_jax.task.env import Env
@@ -50,7 +50,7 @@ def make_env(
     threads = config.physics.threads if threads is None else threads
     refuse_walls(get_robot(config.task.robot), place_of(config.task))
     registry.get_kind(config.task.primitive)  # before anything is packed
-    sensor_of(config.task)
+    camera_sensor(config.task.sensor, config.task.camera)
     bank = load_split_bank(config, split, making=making)
     eligible = eligible_targets(get_robot(config.task.robot), bank, origin=str(config.assets.object_dir or "built in"))
     scenes = scene_bank.load_or_build(bank, eligible, config.scene, split, threads=threads, progress=progress)
@@ -109,7 +109,7 @@ def assemble(
     robot, workspace = get_robot(config.task.robot), place_of(config.task)
     refuse_walls(robot, workspace)
     eligible = eligible_targets(robot, bank) if eligible is None else eligible
-    reach, sensor, num_variants = longest_push(config), sensor_of(config.task), 1
+    reach, sensor, num_variants = longest_push(config), camera_sensor(config.task.sensor, config.task.camera), 1
     if _spread(sensor) != _spread(CLEAN):
         mass_spread, friction_spread = _spread(sensor)
         bank = spread.vary(bank, mass_spread=mass_spread, friction_spread=friction_spread, seed=sensor.seed)
@@ -118,21 +118,6 @@ def assemble(
     engines = registry.get_kind(config.task.primitive).engines
     engine = make_engine(config.physics.engine, bank, robot, workspace, threads=threads, engines=engines)
     return Env(config.task, workspace, robot, *parts, bank, eligible, scenes, engine, reach, sensor, num_variants)
-
-
-def sensor_of(task: TaskConfig) -> Sensor:
-    """Return the sensor of a task.
-
-    Raises:
-        ValueError: there is none of this name, its file cannot be used, or the camera is not the pinhole.
-    """
-    sensor = get_sensor(task.sensor)
-    if sensor != CLEAN and task.camera != "pinhole":
-        raise ValueError(
-            f"task.sensor = {task.sensor!r} is what a pinhole camera gets wrong, but task.camera = {task.camera!r}; "
-            "allowed with it is pinhole"
-        )
-    return sensor
 
 
 def _spread(sensor: Sensor) -> tuple[float, float]:
@@ -191,7 +176,7 @@ def with_task(env: Env, **changes: object) -> Env:
         ValueError: a sensor under which the objects themselves would be others.
     """
     task = dataclasses.replace(env.task, **changes)  # pyright: ignore[reportArgumentType]
-    sensor = sensor_of(task)
+    sensor = camera_sensor(task.sensor, task.camera)
     if (_spread(sensor), sensor.seed) != (_spread(env.sensor), env.sensor.seed) and _spread(sensor) != _spread(CLEAN):
         raise ValueError(
             f"task.sensor = {task.sensor!r} has other objects than {env.task.sensor!r}; allowed is `make_env`"
