@@ -18,7 +18,7 @@ from pregrasp_jax import heightmap
 from pregrasp_jax.config import AssetsConfig, Config, SceneConfig
 from pregrasp_jax.deploy.build import make_decider, nominal_view
 from pregrasp_jax.deploy.bundle import Bundle
-from pregrasp_jax.deploy.cell import Cell
+from pregrasp_jax.deploy.cell import Cell, TableSettings
 from pregrasp_jax.deploy.decision import Push
 from pregrasp_jax.deploy.devices import Frame
 from pregrasp_jax.deploy.files import masks_of_ids
@@ -144,6 +144,10 @@ def make_programs(bundle: Bundle, cell: Cell) -> Programs:
     return Programs(make_env(config.validate(), split="test"))
 
 
+_OWN = ("camera", "table", "robot", "gripper", "segmenter", "target")
+"""What of a cell's file is about real devices."""
+
+
 def make_simulated_station(
     bundle: Bundle,
     cell: Cell,
@@ -152,11 +156,11 @@ def make_simulated_station(
     log: Path | None = None,
     say: Callable[[str], None] = print,
 ) -> Station:
-    """Return a station whose every device is simulated; its camera is the contract's, whatever the cell says.
+    """Return a station whose every device is simulated; its camera is the contract's, its table level with the base.
 
     Args:
         bundle: the policy.
-        cell: which scene, objects and sensor.
+        cell: which scene, objects and sensor, and how maps are made; a note says what else of it is not used.
         programs: from `make_programs`, where they are at hand.
         log: folder for decisions, None for none.
         say: told what happens.
@@ -166,7 +170,10 @@ def make_simulated_station(
     """
     if cell.sim.scene < 0:
         raise ValueError(f"sim.scene = {cell.sim.scene} is out of range; allowed is 0 and more")
-    decider = make_decider(bundle, cell)
+    own = [name for name in _OWN if getattr(cell, name) != getattr(Cell(), name)]
+    if own:
+        say(f"note: a simulated cell has its own {', '.join(own)}; those of the file are not used")
+    decider = make_decider(bundle, dataclasses.replace(cell, table=TableSettings()))
     decisions = DecisionLog(log, bundle.contract) if log else None
     scene = SimulatedCell(programs or make_programs(bundle, cell), cell.sim.scene)
     return Station(

@@ -12,6 +12,9 @@ import yaml
 
 from pregrasp_jax.messages import one_line
 
+_END = re.compile(rb"\n---\s*\Z")
+"""Begins a document that holds nothing: how ROS ends what it prints."""
+
 _CORE_SCHEMA = {
     "null": (r"~|null|Null|NULL|", "~nN"),
     "bool": (r"true|True|TRUE|false|False|FALSE", "tTfF"),
@@ -31,7 +34,7 @@ def read(path: Path) -> Any:
         ValueError: the file cannot be read, is not YAML, or names a key twice; one line says where.
     """
     try:
-        return yaml.load(path.read_bytes(), _Loader)
+        return yaml.load(_END.sub(b"\n", path.read_bytes()), _Loader)
     except yaml.MarkedYAMLError as error:
         said = ", ".join(filter(None, (error.context, error.problem)))
         raise ValueError(f"{path}: {_place(error)}{one_line(said)}") from None

@@ -1,5 +1,6 @@
 """Poses of a tool, calibrations in every form, and the files that describe a cell."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +104,9 @@ def test_calibrations_that_cannot_be_are_refused(tmp_path: Path):
         read_pose(tmp_path / "bad.npy")
     with pytest.raises(ValueError, match="allowed are easy_handeye2's"):
         read_pose(tmp_path / "pose.docx")
+    (tmp_path / "cut.npy").write_bytes(b"PK\x03\x04 and no more")
+    with pytest.raises(ValueError, match=r"cut\.npy cannot be read"):
+        read_pose(tmp_path / "cut.npy")
 
 
 def cell_file(folder: Path, text: str) -> Path:
@@ -136,6 +140,38 @@ def test_a_camera_info_is_read(tmp_path: Path, decider: Decider):
     )
     camera = camera_of(cell.camera, decider.body.arm, tmp_path)
     assert camera.shape == (480, 640) and camera.distortion[:2] == (-0.05, 0.06) and camera.matrix[0, 0] == 617
+    printed = "header: {frame_id: c}\n" + yaml.safe_dump({**info, "distortion_model": "plumb_bob"}) + "---\n"
+    calibrated = {
+        "image_width": 640,
+        "image_height": 480,
+        "camera_name": "c",
+        "camera_matrix": {"rows": 3, "cols": 3, "data": info["k"]},
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": {"rows": 1, "cols": 5, "data": info["d"]},
+    }
+    for text in (printed, yaml.safe_dump(calibrated)):
+        (tmp_path / "info.yaml").write_text(text)
+        again = camera_of(cell.camera, decider.body.arm, tmp_path)
+        assert again.shape == camera.shape and again.distortion == camera.distortion
+        np.testing.assert_array_equal(again.matrix, camera.matrix)
+
+
+@pytest.mark.parametrize(
+    ("camera", "said"),
+    [
+        ({}, "distortion_model is equidistant; allowed is plumb_bob, so rectify the images before"),
+        ({"width": 320}, "camera.width is what info.yaml says; allowed is to leave it out"),
+        ({"intrinsics": np.eye(3).tolist(), "extrinsics": [[1.0, 0.0], [0.0]]}, "has rows of [2, 1] numbers"),
+    ],
+)
+def test_cameras_that_are_not_what_they_say_are_refused(camera: dict, said: str, tmp_path: Path, decider: Decider):
+    info = {"width": 640, "height": 480, "k": [617.0, 0, 319.5, 0, 617.0, 239.5, 0, 0, 1], "d": [0.1, 0, 0, 0]}
+    (tmp_path / "info.yaml").write_text(yaml.safe_dump({**info, "distortion_model": "equidistant"}))
+    np.save(tmp_path / "m.npy", MATRIX)
+    given = {"intrinsics": "info.yaml", "extrinsics": "m.npy", **camera}
+    cell = read_cell(cell_file(tmp_path, yaml.safe_dump({"camera": given})))
+    with pytest.raises(ValueError, match=re.escape(said)):
+        camera_of(cell.camera, decider.body.arm, tmp_path)
 
 
 @pytest.mark.parametrize(

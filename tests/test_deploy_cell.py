@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ from PIL import Image
 from pregrasp_jax.cli.main import main
 from pregrasp_jax.deploy.cell import read_cell
 from pregrasp_jax.deploy.decision import allowed_pushes
+from pregrasp_jax.deploy.log import draw_log
 
 ROOT = Path(__file__).parent.parent
 INTRINSICS = [[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]
@@ -66,6 +68,12 @@ def test_a_dry_trial_is_decided_logged_and_drawn(tmp_path: Path, capsys):
     assert main(["deploy", "--replay", str(log)]) == 0
     with Image.open(log / "decision-000.png") as picture:
         assert picture.size == (1200, 300)
+    for change in ({"push": {}}, {"labels": []}, {"choices": ["a"] * 9}, {"push": {"choice": about["push"]["choice"]}}):
+        (tmp_path / "bad").mkdir(exist_ok=True)
+        shutil.copy(log / "decision-000.npz", tmp_path / "bad")
+        (tmp_path / "bad" / "decision-000.json").write_text(json.dumps({**about, **change}))
+        with pytest.raises(ValueError, match=r"decision-000\.json is damaged"):
+            draw_log(tmp_path / "bad")
     for options, problem in (
         (["deploy", str(small_bundle()), "--config", str(cell), "--log", str(log)], "of an earlier trial"),
         (["deploy", "--replay", str(tmp_path)], "holds no decisions"),

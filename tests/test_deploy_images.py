@@ -160,6 +160,22 @@ def test_targets_and_masks_that_are_not_there_are_refused(tmp_path: Path):
             from_mask_rcnn(output)
     np.savez(tmp_path / "masks.npz", masks=detections()["masks"].values, labels=[44, 47, 1], scores=[0.9, 0.8, 0.2])
     assert read_masks(tmp_path / "masks.npz").names == ("44", "47")
+    held = {"masks": detections()["masks"].values, "labels": [44, 47, 1], "scores": [0.9, 0.8, 0.2]}
+    for changed, said in (
+        ({"names": "[1]"}, "holds no masks"),
+        ({"names": "garbage"}, "holds no masks"),
+        ({"labels": ["mug", "cup", "can"]}, "labels or scores are no numbers"),
+        ({"scores": [np.nan, 0.8, 0.2]}, "labels or scores are no numbers"),
+    ):
+        np.savez(tmp_path / "masks.npz", **{**held, **changed})
+        with pytest.raises(ValueError, match=rf"masks\.npz.*{said}"):
+            read_masks(tmp_path / "masks.npz")
+    np.savez_compressed(tmp_path / "whole.npz", **held)
+    whole = (tmp_path / "whole.npz").read_bytes()
+    for data in (whole[: len(whole) // 2], whole[:200] + bytes(100) + whole[300:], b""):
+        (tmp_path / "masks.npz").write_bytes(data)
+        with pytest.raises(ValueError, match=r"masks\.npz cannot be read"):
+            read_masks(tmp_path / "masks.npz")
     (tmp_path / "masks.png").write_bytes(b"no picture")
     with pytest.raises(ValueError, match="cannot be read as a picture"):
         read_masks(tmp_path / "masks.png")

@@ -99,6 +99,13 @@ def reproduced(tmp_path_factory) -> tuple[SweepFolder, Spec]:
     return folder, spec
 
 
+def test_the_page_alone_is_made_alone(tmp_path, capsys):
+    for options in (["--dry-run", "True"], ["--seeds", "7", "8"], ["--budget", "3"]):
+        with pytest.raises(SystemExit) as exit_info:
+            main(["reproduce", "table2", "--dir", str(tmp_path), "--only-page", "True", *options])
+        assert exit_info.value.code == 2 and "allowed beside it: --dir and --size" in capsys.readouterr().err
+
+
 def test_the_page_has_the_papers_numbers_beside_ours(reproduced, tmp_path):
     folder, spec = reproduced
     experiment = experiments.read_experiment("table2")

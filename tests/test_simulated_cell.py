@@ -2,14 +2,15 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
-from bundles import random_policy
+from bundles import SMALL, random_policy
 
 from pregrasp_jax import simulated_cell
 from pregrasp_jax.config import AssetsConfig, Config, NetworkConfig, PhysicsConfig, SceneConfig, TaskConfig
 from pregrasp_jax.deploy.bundle import read_bundle
-from pregrasp_jax.deploy.cell import Cell, SimSettings
+from pregrasp_jax.deploy.cell import Cell, RuntimeSettings, SimSettings, TableSettings, TargetSettings
 from pregrasp_jax.evaluation_config import EvaluationConfig, TaskOverrides, environment_config
 from pregrasp_jax.export.bundle import export_policy
 
@@ -52,3 +53,22 @@ def test_objects_and_scenes_are_those_of_an_evaluation(scene, tmp_path: Path, mo
     assert split == "test"
     for name in ("task", "assets", "scene", "physics"):
         assert getattr(found, name) == getattr(wanted, name), name
+
+
+def test_what_is_about_real_devices_is_not_used_and_said_to_be(monkeypatch):
+    """The simulated table is level with the base: the policy of a cell with a lower one would find it out of reach."""
+    said: list[str] = []
+
+    def stop(bundle: Any, cell: Cell) -> None:
+        raise Asked(cell)
+
+    monkeypatch.setattr(simulated_cell, "make_decider", stop)
+    cell = Cell(table=TableSettings(height_m=0.1), target=TargetSettings(name="44"), runtime=RuntimeSettings(threads=2))
+    with pytest.raises(Asked) as asked:
+        simulated_cell.make_simulated_station(SMALL.bundle, cell, say=said.append)
+    (used,) = asked.value.args
+    assert used.table == TableSettings() and used.runtime == cell.runtime
+    assert said == ["note: a simulated cell has its own table, target; those of the file are not used"]
+    with pytest.raises(Asked):
+        simulated_cell.make_simulated_station(SMALL.bundle, Cell(sim=SimSettings(scene=3)), say=said.append)
+    assert len(said) == 1

@@ -1,5 +1,6 @@
 """The folder of a sweep: what is written to it, by whom, and what of it may be edited."""
 
+import json
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -107,3 +108,19 @@ def test_all_seeds_of_a_proposal_are_written_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(io, "append_json_lines", count)
     assert driver.Driver(folder, spec, Nowhere(), say=lambda line: None)._propose([])
     assert written == [2] and [(s.trial.number, s.trial.seed) for s in folder.states()] == [(0, 0), (1, 1)]
+
+
+@pytest.mark.parametrize(
+    ("first", "said"),
+    [
+        ([], "does not begin with the sweep's settings"),
+        ({"event": "sweep"}, "does not begin with the sweep's settings"),
+        ({"event": "sweep", "spec": {"preset": "ci"}, "cwd": 3}, "does not begin with the sweep's settings"),
+        ({"event": "sweep", "spec": {"preset": 5}, "cwd": "."}, "preset = '5' does not exist"),
+    ],
+)
+def test_a_sweep_that_does_not_say_what_it_is_is_damaged(first, said, tmp_path):
+    folder = SweepFolder.create(tmp_path / "sweep", make_spec())
+    (folder.path / "trials.jsonl").write_text(json.dumps(first) + "\n")
+    with pytest.raises(ValueError, match=r"trials\.jsonl.*" + said):
+        folder.spec()

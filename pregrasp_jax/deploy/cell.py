@@ -17,6 +17,8 @@ from pregrasp_jax.settings import from_dict
 
 Rows = tuple[tuple[float, ...], ...]
 
+_LENS = "plumb_bob"
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
@@ -178,6 +180,9 @@ def _refuse_ranges(cell: Cell) -> None:
             raise ValueError(f"{key} = {value} is out of range; allowed is {low:g} to {high:g}")
 
 
+_CAMERA = CameraSettings()
+
+
 def target_of(cell: Cell) -> Target:
     """Return which object is wanted.
 
@@ -208,30 +213,57 @@ def camera_of(settings: CameraSettings, arm: Arm, folder: Path) -> PinholeCamera
     given = settings.extrinsics
     if given is None:
         raise ValueError("camera.extrinsics is missing; allowed is a 4 x 4 matrix or the file of a calibration")
-    pose = read_pose(folder / given) if isinstance(given, str) else np.array(given, float)
+    pose = read_pose(folder / given) if isinstance(given, str) else _rows(given, "camera.extrinsics")
     refuse_pose(pose, what="camera.extrinsics")
     pose = world_from(settings.parent, arm) @ optical_from(pose, settings.frame)
     return PinholeCamera(matrix=matrix, world_from_optical=pose, shape=shape, distortion=distortion)
+
+
+def _rows(given: Rows, key: str) -> np.ndarray:
+    lengths = [len(row) for row in given]
+    if len(set(lengths)) > 1:
+        raise ValueError(f"{key} has rows of {lengths} numbers; allowed is a 4 x 4 matrix")
+    return np.array(given, float)
 
 
 def _intrinsics(settings: CameraSettings, folder: Path) -> tuple[np.ndarray, tuple[int, int], tuple[float, ...]]:
     """Return K, (rows, columns) and the distortion."""
     shape = (settings.height, settings.width)
     if isinstance(settings.intrinsics, str):
-        path = folder / settings.intrinsics
-        values = yaml_file.read(path)
-        try:
-            matrix = np.array(values.get("k", values.get("K")), float).reshape(3, 3)
-            shape = (int(values["height"]), int(values["width"]))
-            distortion = tuple(float(x) for x in values.get("d", values.get("D", ())))
-        except (AttributeError, KeyError, TypeError, ValueError):
-            raise ValueError(
-                f"{path} is no CameraInfo; allowed is YAML with k (9 numbers), d, width and height"
-            ) from None
-        return matrix, shape, distortion or (0.0,) * 5
+        for name in ("width", "height", "distortion"):
+            if getattr(settings, name) != getattr(_CAMERA, name):
+                raise ValueError(f"camera.{name} is what {settings.intrinsics} says; allowed is to leave it out")
+        return _camera_info(folder / settings.intrinsics)
     if settings.intrinsics is None:
         raise ValueError("camera.intrinsics is missing; allowed is K as three rows, or a CameraInfo file")
     try:
         return np.array(settings.intrinsics, float).reshape(3, 3), shape, settings.distortion
     except ValueError:
         raise ValueError(f"camera.intrinsics = {settings.intrinsics}; allowed are three rows of three") from None
+
+
+def _camera_info(path: Path) -> tuple[np.ndarray, tuple[int, int], tuple[float, ...]]:
+    """Return K, (rows, columns) and the distortion of a file of ROS: CameraInfo, or what its calibration writes.
+
+    Raises:
+        ValueError: it is neither, or of a lens that this camera is not.
+    """
+    values = yaml_file.read(path)
+    try:
+        if "camera_matrix" in values:
+            k, d = values["camera_matrix"]["data"], values["distortion_coefficients"]["data"]
+            size = values["image_height"], values["image_width"]
+        else:
+            k, d = values.get("k", values.get("K")), values.get("d", values.get("D", ()))
+            size = values["height"], values["width"]
+        model = values.get("distortion_model") or _LENS
+        matrix, distortion = np.array(k, float).reshape(3, 3), tuple(float(x) for x in d)
+        rows, columns = int(size[0]), int(size[1])
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise ValueError(
+            f"{path} is no CameraInfo; allowed is YAML with k (9 numbers), d, width and height, or with camera_matrix, "
+            "distortion_coefficients, image_width and image_height"
+        ) from None
+    if model != _LENS:
+        raise ValueError(f"{path}: distortion_model is {model}; allowed is {_LENS}, so rectify the images before")
+    return matrix, (rows, columns), distortion or (0.0,) * 5

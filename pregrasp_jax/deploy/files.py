@@ -115,12 +115,22 @@ def read_masks(path: Path, *, min_score: float = 0.5) -> Masks:
     """
     if path.suffix == ".npz":
         held = _load(path)
-        names = {int(k): str(v) for k, v in json.loads(str(held["names"])).items()} if "names" in held else None
-        return from_mask_rcnn({key: held[key] for key in held if key != "names"}, names, min_score=min_score)
+        try:
+            names = _names(held.pop("names")) if "names" in held else None
+            return from_mask_rcnn(held, names, min_score=min_score)
+        except (AttributeError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{path} holds no masks ({one_line(error)}); allowed are masks, labels (whole numbers), scores and, as "
+                "JSON, names of labels"
+            ) from None
     ids = read_image(path)
     if ids.ndim != 2:
         raise ValueError(f"{path} has shape {list(ids.shape)}; allowed is a grey .png of instance ids, 0 for the table")
     return masks_of_ids(ids)
+
+
+def _names(text: np.ndarray) -> dict[int, str]:
+    return {int(label): str(name) for label, name in json.loads(str(text)).items()}
 
 
 def masks_of_ids(ids: np.ndarray) -> Masks:
@@ -138,5 +148,5 @@ def _load(path: Path) -> Any:
             return loaded
         with loaded:
             return {name: loaded[name] for name in loaded.files}
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # whatever is wrong with the file: zipfile and zlib have errors of their own
         raise ValueError(f"{path} cannot be read ({one_line(error)})") from None

@@ -103,23 +103,32 @@ def draw_log(folder: Path) -> list[Path]:
     written = []
     for path in sorted(folder.glob("decision-*.json")):
         about, arrays = _read(path)
-        push = about["push"]
-        start = arrays["hand"][:2].tolist()
-        height = np.clip(arrays["height_m"] / 0.30 * 255, 0, 255).astype(np.uint8)
-        tiles = [drawing.draw_heightmap(height), drawing.draw_labels(arrays["map_labels"], about["labels"])]
-        allowed = arrays["q"][arrays["allowed"]]
-        limits = (float(allowed.min()), float(allowed.max())) if allowed.size else (0.0, 1.0)
-        for index, choice in enumerate(about["choices"]):
-            taken = push is not None and push["choice"] == choice
-            arrow = (start, push["end_table_m"][:2]) if taken else None
-            mask = arrays["allowed"][..., index]
-            tiles.append(drawing.draw_q_map(arrays["q"][..., index], mask, push=arrow, limits=limits, backdrop=height))
-        picture = path.with_suffix(".png")
-        drawing.save_image(picture, np.concatenate(tiles, axis=1))
-        written.append(picture)
+        try:
+            picture = _draw(about, arrays)
+        except Exception as error:  # whatever is missing, or of another kind
+            raise ValueError(f"{path} is damaged ({one_line(error)}); allowed is what `deploy --log` writes") from None
+        drawing.save_image(path.with_suffix(".png"), picture)
+        written.append(path.with_suffix(".png"))
     if not written:
         raise ValueError(f"{folder} holds no decisions; allowed is a folder that `deploy --log` has written")
     return written
+
+
+def _draw(about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return heights, labels and values of a decision side by side, and its push."""
+    from pregrasp_jax import drawing
+
+    push, start = about["push"], arrays["hand"][:2].tolist()
+    height = np.clip(arrays["height_m"] / 0.30 * 255, 0, 255).astype(np.uint8)
+    tiles = [drawing.draw_heightmap(height), drawing.draw_labels(arrays["map_labels"], about["labels"])]
+    allowed = arrays["q"][arrays["allowed"]]
+    limits = (float(allowed.min()), float(allowed.max())) if allowed.size else (0.0, 1.0)
+    for index, choice in enumerate(about["choices"]):
+        taken = push is not None and push["choice"] == choice
+        arrow = (start, push["end_table_m"][:2]) if taken else None
+        mask = arrays["allowed"][..., index]
+        tiles.append(drawing.draw_q_map(arrays["q"][..., index], mask, push=arrow, limits=limits, backdrop=height))
+    return np.concatenate(tiles, axis=1)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

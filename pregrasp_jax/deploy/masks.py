@@ -146,6 +146,8 @@ def from_mask_rcnn(output: Any, names: Mapping[int, str] | None = None, *, min_s
             f"Mask R-CNN masks have shape {list(masks.shape)} for {len(labels)} labels; allowed is [N, 1, rows, "
             "columns] or [N, rows, columns]"
         )
+    if labels.dtype.kind not in "iuf" or not np.isfinite(np.asarray(scores, float)).all():
+        raise ValueError("Mask R-CNN labels or scores are no numbers; allowed are whole numbers, and scores of 0 to 1")
     masks = masks > THRESHOLD if masks.dtype.kind == "f" else masks.astype(bool)
     sure = np.flatnonzero(scores >= min_score)
     kept = sure[np.argsort(-scores[sure], kind="stable")]

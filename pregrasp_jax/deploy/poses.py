@@ -97,7 +97,7 @@ def read_pose(path: Path) -> np.ndarray:
             raise ValueError(f"{path}: {wanted}")
         try:
             matrix = np.asarray(readers[path.suffix](), float)
-        except (OSError, ValueError, TypeError) as error:
+        except Exception as error:  # whatever is wrong with the file: zipfile has errors of its own
             raise ValueError(f"{path} cannot be read ({one_line(error)}); {wanted}") from None
     refuse_pose(matrix, what=f"{path}: the pose")
     return matrix
