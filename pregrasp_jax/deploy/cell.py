@@ -18,6 +18,7 @@ from pregrasp_jax.settings import from_dict
 Rows = tuple[tuple[float, ...], ...]
 
 _LENS = "plumb_bob"
+"""What ROS calls Brown's model of a lens, which is `PinholeCamera`'s."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,9 +181,6 @@ def _refuse_ranges(cell: Cell) -> None:
             raise ValueError(f"{key} = {value} is out of range; allowed is {low:g} to {high:g}")
 
 
-_CAMERA = CameraSettings()
-
-
 def target_of(cell: Cell) -> Target:
     """Return which object is wanted.
 
@@ -231,7 +229,7 @@ def _intrinsics(settings: CameraSettings, folder: Path) -> tuple[np.ndarray, tup
     shape = (settings.height, settings.width)
     if isinstance(settings.intrinsics, str):
         for name in ("width", "height", "distortion"):
-            if getattr(settings, name) != getattr(_CAMERA, name):
+            if getattr(settings, name) != getattr(CameraSettings(), name):
                 raise ValueError(f"camera.{name} is what {settings.intrinsics} says; allowed is to leave it out")
         return _camera_info(folder / settings.intrinsics)
     if settings.intrinsics is None:
