@@ -115,7 +115,7 @@ def summary(cleared: list[Cleared]) -> dict[str, Any]:
         "sr_1_ci95": list(wilson_interval(sum(first), len(first))),
         "sr_n": sum(strokes) / len(strokes),
         "sr_n_ci95": list(wilson_interval(sum(strokes), len(strokes))),
-        "clearance": float(np.mean([(scene.removed + 1) / scene.objects for scene in cleared])),
+        "clearance": float(np.mean([min(scene.removed + 1, scene.objects) / scene.objects for scene in cleared])),
         "strokes": len(strokes),
         "collided": sum(scene.collided for scene in cleared),
     }

@@ -204,6 +204,11 @@ def workspace_of(document: Mapping[str, Any]) -> str:
     return document.get("workspace", TaskConfig().workspace)
 
 
+def world_of(document: Mapping[str, Any]) -> list[Any]:
+    """Return on what objects and scenes, and where, an evaluation was run."""
+    return [*(document.get(key) for key in _SAME), workspace_of(document), document.get("workspace_hash", "")]
+
+
 def _places(a: Mapping[str, Any], b: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the places of two evaluations if they differ, in name or dimensions; older files name none."""
     names = tuple(map(workspace_of, (a, b)))

@@ -135,6 +135,9 @@ def _place(run: RunRecord) -> Iterator[str]:
     for name, value in place.items() if isinstance(place, dict) else ():
         if value is not None:
             yield from (f"--task.place.{name.replace('_', '-')}", str(value))
+    mirrored = run.setting("task", "mirrored_start", TaskConfig().mirrored_start)
+    if mirrored != TaskConfig().mirrored_start:
+        yield from ("--task.mirrored-start", str(mirrored))
 
 
 def _row(run: RunRecord, document: dict[str, Any], of_this_run: Sequence[dict[str, Any]]) -> Markup:
@@ -172,11 +175,12 @@ def _motions(document: dict[str, Any]) -> str:
 
 
 def _paired(of_this_run: Sequence[dict[str, Any]], other: dict[str, Any]) -> str:
-    """Return the difference in points of the first evaluation of the run on the very same scenes, counted alike.
+    """Return the difference in points of the run's policy alone on the very same scenes, counted alike.
 
     What was seen through the same camera and sensor comes first; scripts see nothing.
     """
-    alike = [document for document in of_this_run if counting_of(document) == counting_of(other)]
+    alone = [document for document in of_this_run if decides_alone(document)]
+    alike = [document for document in alone if counting_of(document) == counting_of(other)]
     for document in sorted(alike, key=lambda document: _seen_by(document) != _seen_by(other)):
         try:
             found = compare(document, other)
@@ -185,9 +189,9 @@ def _paired(of_this_run: Sequence[dict[str, Any]], other: dict[str, Any]) -> str
         low, high = found.difference_ci95
         text = f"{100 * found.difference:+.0f} points ({100 * low:+.0f} to {100 * high:+.0f}), p = {found.p_value:.2g}"
         return text.replace("-", "\N{MINUS SIGN}")
-    if not of_this_run:
+    if not alone:
         return ""
-    if workspace_of(other) not in map(workspace_of, of_this_run):
+    if workspace_of(other) not in map(workspace_of, alone):
         return "in another place"
     return "not on the same scenes" if alike else "counted in another way"
 

@@ -12,8 +12,10 @@ from pregrasp_jax.evaluation.aggregates import (
     measured_interval,
     noise,
     pooled,
+    scene_of,
 )
 from pregrasp_jax.evaluation.results import load_evaluation
+from pregrasp_jax.evaluation.statistics import world_of
 from pregrasp_jax.sweep import driver, state
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.spec import Spec
@@ -33,6 +35,7 @@ class Tested:
         interval: 95 %, over seeds and scenes.
         motions: mean pushes per success.
         rates: of the seeds.
+        met: what was met; only settings that met the same are compared.
     """
 
     outcomes: Outcomes
@@ -40,6 +43,7 @@ class Tested:
     interval: Interval
     motions: float | None
     rates: tuple[float, ...]
+    met: list[Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,6 +193,7 @@ def tested(documents: Sequence[Mapping[str, Any]]) -> Tested:
         interval=interval(outcomes),
         motions=state.mean(motions) if motions else None,
         rates=tuple(outcomes.rates.tolist()),
+        met=[world_of(documents[0]), scene_of(documents[0])],
     )
 
 
@@ -196,8 +201,8 @@ def _differences(reference: Row, rows: Sequence[Row]) -> dict[str, dict[str, Dif
     """Return test -> label -> difference from the reference, of the settings that met the same scenes."""
     found: dict[str, dict[str, Difference]] = {}
     for name, own in reference.tests.items():
-        others = {row.label: row.tests[name].outcomes for row in rows if row is not reference and name in row.tests}
-        same = {label: o for label, o in others.items() if len(o.strata) == len(own.outcomes.strata)}
+        others = {row.label: row.tests[name] for row in rows if row is not reference and name in row.tests}
+        same = {label: other.outcomes for label, other in others.items() if other.met == own.met}
         if same:
             found[name] = against(own.outcomes, same)
     return found

@@ -33,7 +33,7 @@ def read_files(path: Path) -> list[bytes]:
         return [data]
     try:
         buffers = external_buffers(data, path.parent)
-    except (KeyError, AttributeError, TypeError) as error:
+    except (KeyError, IndexError, AttributeError, TypeError, RecursionError) as error:
         raise ValueError(f"not a readable {path.suffix.lower()} file: {type(error).__name__} {error}") from error
     for buffer in buffers:
         _refuse_large(buffer)
@@ -88,12 +88,17 @@ def _refuse_large(path: Path) -> None:
 
 
 def _read_stl(files: list[bytes]) -> Surface:
-    """Read an STL; a text one is decoded here, since trimesh knows one encoding."""
+    """Read an STL; a text one is decoded here, since trimesh knows one encoding, and no binary one that is too long."""
     data = files[0]
-    if len(data) < 84 or len(data) != 84 + 50 * int.from_bytes(data[80:84], "little"):
+    size = 84 + 50 * int.from_bytes(data[80:84], "little")
+    if len(data) < 84 or len(data) != size:
         text = decode(data)
         if text.lstrip().lower().startswith("solid"):
-            data = text.encode()
+            data = text.replace("\r\n", "\n").replace("\r", "\n").encode()
+        elif len(data) < size:
+            raise ValueError(f"cut short: {size} bytes are announced, {len(data)} are there")
+        else:
+            data = data[:size]
     mesh = trimesh.load_scene(io.BytesIO(data), file_type="stl", process=False).to_mesh()
     return Surface(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces))
 

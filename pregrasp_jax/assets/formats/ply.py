@@ -39,12 +39,17 @@ class _Rows(NamedTuple):
     sizes: np.ndarray
 
 
+_NOTHING = _Rows(np.zeros(0, int), np.zeros(0, int))
+
+
 def read_ply(data: bytes) -> Surface:
     """Read vertices and faces or triangle strips; colours and normals say nothing.
 
     Raises:
         ValueError: the header is none, or the data is cut short.
     """
+    if data.startswith(b"ply\rformat ascii"):
+        data = data.replace(b"\r", b"\n")
     order, elements, body = _read_header(data)
     columns: dict[str, dict[str, _Rows]] = {}
     words = iter(decode(body).split()) if order == "" else None
@@ -60,9 +65,11 @@ def read_ply(data: bytes) -> Surface:
     if not {"x", "y", "z"} <= vertex.keys():
         raise ValueError("has no element 'vertex' with x, y and z")
     vertices = np.column_stack([vertex[axis].values.astype(np.float64) for axis in "xyz"])
-    if "tristrips" in columns:
-        return from_strips(vertices, _split_strips(_indices(columns["tristrips"])))
-    faces = _indices(columns["face"]) if "face" in columns else _Rows(np.zeros(0, int), np.zeros(0, int))
+    faces, strips = (_indices(columns[name]) if name in columns else _NOTHING for name in ("face", "tristrips"))
+    if len(strips.sizes) and len(faces.sizes):
+        raise ValueError("has faces and triangle strips; allowed is one of them")
+    if len(strips.sizes):
+        return from_strips(vertices, _split_strips(strips))
     return from_polygons(vertices, faces.sizes, faces.values)
 
 

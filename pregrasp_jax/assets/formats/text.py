@@ -1,11 +1,14 @@
 """The text formats: OBJ and OFF, decoded whatever wrote them."""
 
 import codecs
+import re
 from collections.abc import Iterator
 
 import numpy as np
 
 from pregrasp_jax.assets.formats.surface import Surface, from_polygons
+
+_COMMENT = re.compile(r"#[^\n]*")
 
 _MARKS = {codecs.BOM_UTF8: "utf-8", codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 
@@ -80,9 +83,9 @@ def _corner(word: str, count: int) -> int:
 
 def _lines(data: bytes, *, joined: bool = False) -> Iterator[tuple[int, list[str]]]:
     """Yield number and words of every line that is neither empty nor a comment; a backslash may join two."""
-    text = decode(data).replace("\r\n", "\n").replace("\r", "\n")
+    text = _COMMENT.sub("", decode(data).replace("\r\n", "\n").replace("\r", "\n"))
     if joined:
         text = text.replace("\\\n", " ")
     for number, line in enumerate(text.split("\n"), 1):
-        if words := line.partition("#")[0].split():
+        if words := line.split():
             yield number, words
