@@ -127,8 +127,11 @@ class PreGraspVectorEnv(VectorEnv):
         if seed is not None:
             seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, _INTEGER) else list(seed)
             numbers = [int(number) for number in seeds if isinstance(number, _INTEGER)]
-            if not len(numbers) == len(seeds) == self.num_envs:
-                raise ValueError(f"seed = {seed}; allowed is an int, or a list of {self.num_envs}")
+            known = all(0 <= number < 2**32 for number in numbers)
+            if not (known and len(numbers) == len(seeds) == self.num_envs):
+                raise ValueError(f"seed = {seed}; allowed is an int from 0 to 2**32 - 1, or a list of {self.num_envs}")
+            if isinstance(seed, _INTEGER):
+                super().reset(seed=int(seed))
             self._keys = jnp.stack([jax.random.key(number) for number in numbers])
             self._episodes = np.zeros(self.num_envs, np.int32)
         else:

@@ -292,6 +292,21 @@ def test_a_place_in_which_no_push_can_be_executed_is_refused():
         refuse_blocked(ROBOT, blocked, push_in(blocked), mirrored=True)
 
 
+def test_pushes_with_the_open_hand_are_tried_too():
+    """Closed fingers are longer: of the shares of the radii alone an even stride would meet closed ones only."""
+    tried: list[int] = []
+    push = push_in(SHELF)
+
+    def decode(hand: Any, action: jax.Array) -> Any:
+        jax.debug.callback(lambda a: tried.append(int(a)), action)
+        return push.decode(hand, action)
+
+    refuse_blocked(ROBOT, SHELF, dataclasses.replace(push, decode=decode), mirrored=False)
+    jax.effects_barrier()
+    choices = np.array(tried) % push.actions.shape[-1]
+    assert len(tried) == 64 and 16 < choices.sum() < 48
+
+
 def test_a_place_that_only_the_mirrored_arm_is_stuck_in_is_refused_if_it_starts_there():
     walls = tuple(Box(center=(x, y, 0.3), half_size=(0.02, 0.01, 0.3)) for x, y in ((-0.55, 0.12), (-0.2, -0.2)))
     place = Workspace(name="left", walls=walls)

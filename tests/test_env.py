@@ -372,6 +372,12 @@ def other(env) -> Pushes:
     )
 
 
+@pytest.mark.parametrize("change", [{"workspace": "shelf"}, {"robot": "barrett"}, {"primitive": "push_grasp"}])
+def test_a_task_changes_neither_the_robot_nor_the_place_of_an_engine(env, change):
+    with pytest.raises(ValueError, match=r"but these scenes are of .*; allowed is `make_env`"):
+        with_task(env, **change)
+
+
 @pytest.mark.parametrize("name", OTHER_CASES)
 def test_how_a_push_ends_under_another_task(other, name):
     result, case = other.result[name], OTHER_CASES[name]

@@ -154,4 +154,16 @@ def test_refusals(robot):
     ball = "<mujoco><worldbody><body name='a'><geom size='0.1'/></body></worldbody></mujoco>"
     with pytest.raises(ValueError, match="capsule or a box"):
         make(ball, ())
+    for old, new, said in (
+        ('<body name="palm">', '<body name="palm" pos="0 0 0.05">', "body of hand gripper stands at .*0.05"),
+        (
+            'name="left" type="hinge"',
+            'name="left" type="hinge" pos="0 0.06 0"',
+            "left' of the robot has a pos or a ref",
+        ),
+        ('name="left" type="hinge"', 'name="left" type="hinge" ref="0.2"', "left' of the robot has a pos or a ref"),
+        ("0 -1 0 0 0", "0.1 -1 0 0 0", "right' of the robot follows by polycoef .*0.1, -1.0.* allowed is a ratio"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            make(GRIPPER.replace(old, new))
     assert robot.joints[:4] == JOINTS

@@ -100,8 +100,11 @@ def test_refusals_say_what_is_allowed(envs):
         envs.step(np.array([0, 20_000]))
     with pytest.raises(ValueError, match="allowed are 2 of 0 to 19999"):
         envs.step(np.array([0.5, 1.5]))
-    with pytest.raises(ValueError, match="an int, or a list of 2"):
+    with pytest.raises(ValueError, match="or a list of 2"):
         envs.reset(seed=[1])
+    for seed in (-1, 2**32, [0, 2**40]):
+        with pytest.raises(ValueError, match=r"allowed is an int from 0 to 2\*\*32 - 1, or a list of 2"):
+            envs.reset(seed=seed)
     with pytest.raises(ValueError, match="allowed are none"):
         envs.reset(options={"scene": 1})
     with pytest.raises(ValueError, match="num_envs = 0"):

@@ -92,6 +92,7 @@ ELIGIBLE = np.ones(MAX_OBJECTS, bool)
         ({4: 0.96}, {"off_table": np.arange(MAX_OBJECTS) == 6}, ELIGIBLE, None),
         ({4: 0.96}, {"no_action": True}, ELIGIBLE, 4),
         ({4: 0.96}, {"aperture": jnp.float32(0.0)}, ELIGIBLE, None),
+        ({1: 0.99, 4: 0.97}, {"slipped": np.arange(MAX_OBJECTS) == 1}, ELIGIBLE, 4),
     ],
     ids=[
         "one",
@@ -103,6 +104,7 @@ ELIGIBLE = np.ones(MAX_OBJECTS, bool)
         "off table",
         "no action",
         "closed hand",
+        "target too, which slipped",
     ],
 )
 def test_enclosed_obstacle(coverage, flags, eligible, expected):

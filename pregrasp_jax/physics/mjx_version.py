@@ -28,7 +28,7 @@ def require(release: str | None) -> None:
     if release not in SUPPORTED:
         found = f"mujoco-mjx {release} is installed" if release else "mujoco-mjx is not installed"
         wanted = f"allowed: {', '.join(SUPPORTED)} (pip install mujoco-mjx=={SUPPORTED[-1]})"
-        raise ValueError(f"physics.engine = 'mjx' or 'warp': {found}; {wanted}")
+        raise ValueError(f"physics.engine = 'mjx': {found}; {wanted}")
 
 
 require(installed())

@@ -111,6 +111,12 @@ def _carried(name: str, mjcf: str) -> mujoco.MjSpec:
     hand = mujoco.MjSpec.from_string(mjcf)
     if len(hand.worldbody.bodies) != 1 or hand.worldbody.geoms:
         raise ValueError(f"the MJCF of hand {name} holds {len(hand.worldbody.bodies)} bodies; allowed is one, the hand")
+    root = hand.worldbody.bodies[0]
+    if root.pos.any() or not np.array_equal(root.quat, [1, 0, 0, 0]):
+        raise ValueError(
+            f"the body of hand {name} stands at {root.pos.tolist()}, turned by {root.quat.tolist()}; allowed is the "
+            "origin, as it is held: move what is in it"
+        )
     for geom in hand.geoms:
         geom.contype, geom.conaffinity = 2, 1  # objects and the table, not itself: as in mjcf/SOURCES.md
     for body in hand.bodies:

@@ -29,7 +29,8 @@ def make_links(mj_model: mujoco.MjModel, joints: Sequence[str]) -> Links:
 
     Raises:
         ValueError: a geom is neither capsule nor box, the two shapes that every engine collides; a body has several
-            joints, or one that nobody drives.
+            joints, or one that nobody drives; a joint turns about another point than its body's origin, is
+            not 0 as drawn, or follows another one by more than a ratio.
     """
     bodies = range(1, mj_model.nbody)
     moved_by = _moved_by(mj_model, joints)
@@ -50,6 +51,10 @@ def make_links(mj_model: mujoco.MjModel, joints: Sequence[str]) -> Links:
                     f"joint '{mj_model.joint(own).name}' of the robot; allowed are hinges and slides among "
                     f"{', '.join(joints)}, or coupled to one of them"
                 )
+            anchored = kind == mujoco.mjtJoint.mjJNT_HINGE and mj_model.jnt_pos[own].any()
+            if anchored or mj_model.qpos0[mj_model.jnt_qposadr[own]]:
+                name = mj_model.joint(own).name
+                raise ValueError(f"joint '{name}' of the robot has a pos or a ref; allowed is none: move its body")
             axes[link], (joint[link], ratio) = mj_model.jnt_axis[own], moved_by[own]
             (turn if kind == mujoco.mjtJoint.mjJNT_HINGE else slide)[link] = ratio
     geoms = tuple(_link_geom(mj_model, geom) for geom in range(mj_model.ngeom))
@@ -82,9 +87,14 @@ def _moved_by(mj_model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, tupl
     """Return, per joint id, the index into `joints` it follows and its ratio to it."""
     ids = [mj_model.joint(name).id for name in joints]
     result = {joint: (index, 1.0) for index, joint in enumerate(ids)}
-    for equality in range(mj_model.neq):
+    for equality in np.flatnonzero(mj_model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
         follower, leader = mj_model.eq_obj1id[equality], mj_model.eq_obj2id[equality]
         if follower not in result and leader in ids:
+            if mj_model.eq_data[equality, [0, 2, 3, 4]].any():
+                raise ValueError(
+                    f"joint '{mj_model.joint(follower).name}' of the robot follows by polycoef "
+                    f"{mj_model.eq_data[equality, :5].tolist()}; allowed is a ratio alone, 0 r 0 0 0"
+                )
             result[follower] = (ids.index(leader), float(mj_model.eq_data[equality, 1]))
     return result
 

@@ -173,9 +173,13 @@ def with_task(env: Env, **changes: object) -> Env:
     """Return the same scenes and engine under a changed task, for example another `r_out` or camera.
 
     Raises:
-        ValueError: a sensor under which the objects themselves would be others.
+        ValueError: a robot, a place or a primitive that the engine was not made for, or a sensor under which the
+            objects themselves would be others.
     """
     task = dataclasses.replace(env.task, **changes)  # pyright: ignore[reportArgumentType]
+    for name in ("robot", "workspace", "place", "primitive"):
+        if (asked := getattr(task, name)) != (made := getattr(env.task, name)):
+            raise ValueError(f"task.{name} = {asked!r}, but these scenes are of {made!r}; allowed is `make_env`")
     sensor = camera_sensor(task.sensor, task.camera)
     if (_spread(sensor), sensor.seed) != (_spread(env.sensor), env.sensor.seed) and _spread(sensor) != _spread(CLEAN):
         raise ValueError(

@@ -45,8 +45,8 @@ def refuse_walls(robot: Robot, workspace: Workspace) -> None:
             )
         if clear < CLEARANCE_MARGIN:
             raise ValueError(
-                f"workspace '{workspace.name}': wall {index} is {clear:.3f} m from robot {robot.name} at its start "
-                f"pose; allowed is {CLEARANCE_MARGIN} m or more"
+                f"workspace '{workspace.name}': robot {robot.name} at its start pose is {clear:.3f} m from wall "
+                f"{index} or the table; allowed is {CLEARANCE_MARGIN} m or more"
             )
 
 
@@ -89,7 +89,8 @@ def refuse_blocked(robot: Robot, workspace: Workspace, primitive: Primitive, *, 
         return
     start = jax.tree.map(jnp.asarray, robot.start)
     allowed = np.flatnonzero(jax.jit(primitive.mask)(start))
-    tried = jnp.asarray(allowed[:: -(-len(allowed) // _TRIED_ACTIONS)], jnp.int32)
+    # Drawn, since an even stride would meet the same choices everywhere.
+    tried = np.random.default_rng(0).permutation(allowed)[:_TRIED_ACTIONS].astype(np.int32)
 
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(0, None))
@@ -98,7 +99,7 @@ def refuse_blocked(robot: Robot, workspace: Workspace, primitive: Primitive, *, 
         return primitive.plan(home, primitive.decode(start, action)).obstruction
 
     postures = ("", "mirrored ") if mirrored else ("",)
-    codes = np.asarray(obstructions(jnp.asarray(robot.homes[: len(postures)]), tried))
+    codes = np.asarray(obstructions(jnp.asarray(robot.homes[: len(postures)]), jnp.asarray(tried)))
     for posture, found in zip(postures, codes, strict=True):
         if not (found == OBSTRUCTIONS.index("none")).any():
             reasons = ", ".join(f"{OBSTRUCTIONS[code]} {count}" for code, count in Counter(found).most_common())

@@ -141,8 +141,9 @@ def judging(
 
     def hindsight_goal(outcome: Outcome, goal: jax.Array, eligible: jax.Array) -> tuple[jax.Array, jax.Array]:
         assert outcome.coverage.shape == eligible.shape, f"{outcome.coverage.shape} and {eligible.shape} differ"
-        # A target in the region as well never gets here: `end_reason` prefers it.
-        candidates = in_region(outcome, region_exists(outcome.aperture)) & eligible
+        # The target may lie there as well, if it slipped when its grasp was tried.
+        others = eligible & (jnp.arange(eligible.shape[0]) != goal)
+        candidates = in_region(outcome, region_exists(outcome.aperture)) & others
         slot = jnp.argmax(jnp.where(candidates, outcome.coverage, -1.0)).astype(jnp.int32)
         return slot, jnp.any(candidates) & (reason_for(outcome, goal) == OBSTACLE_IN_REGION)
 
