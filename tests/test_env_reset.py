@@ -165,7 +165,7 @@ def test_settings_that_cannot_work_are_refused(monkeypatch):
         ),
         (
             Box(center=(-0.5, 0.0, 0.3), half_size=(0.01, 0.4, 0.3)),
-            r"wall 1 is -?0\.\d+ m from .* is 0\.015",
+            r"robot .* is -?0\.\d+ m from wall 1 or the table; allowed is 0\.015",
         ),
     ],
 )

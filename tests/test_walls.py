@@ -66,7 +66,7 @@ def test_a_wall_inside_the_grid_has_its_height_and_the_id_of_the_table():
     ("wall", "line"),
     [
         (Box(center=(0.0, 0.22, 0.1), half_size=(0.1, 0.01, 0.1)), "within 0.210 m of the centre"),
-        (Box(center=(-0.45, 0.0, 0.1), half_size=(0.02, 0.2, 0.1)), "at its start pose; allowed is 0.015 m"),
+        (Box(center=(-0.45, 0.0, 0.1), half_size=(0.02, 0.2, 0.1)), "m from wall 0 or the table; allowed is 0.015 m"),
     ],
 )
 def test_a_wall_in_the_way_is_refused(wall, line):
