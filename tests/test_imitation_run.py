@@ -131,6 +131,8 @@ def test_the_measures_of_ppgs_own_protocol():
     ]
     found = summary(scenes)
     assert found["sr_1"] == 0.5 and found["sr_n"] == 3 / 5 and found["clearance"] == (5 / 5 + 4 / 8) / 2
+    two_at_once = Cleared(scene=2, objects=2, removed=2, stable=(False,), collided=0)
+    assert summary([two_at_once])["clearance"] == 1
     assert found["strokes"] == 5 and found["collided"] == 1 and found["sr_1_ci95"][0] > 0
 
 

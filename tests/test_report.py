@@ -9,7 +9,7 @@ from report_files import ROWS, evaluation_row, log_row, run_main, write_evaluati
 from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.report import build_page, load_evaluations, read_run
 from pregrasp_jax.report.charts import duration, failure_figures, learning_figures, time_figures
-from pregrasp_jax.report.results import SCRIPTS, is_of_run, missing
+from pregrasp_jax.report.results import SCRIPTS, _paired, is_of_run, missing, of_run
 from pregrasp_jax.settings import to_dict
 
 
@@ -80,6 +80,21 @@ def test_rates_that_were_counted_or_seen_differently_are_told_apart(tmp_path: Pa
     rows = {cells[i]: cells[i + 1 : i + 10] for i, cell in enumerate(cells) if cell in ("clear", "pretrained")}
     assert rows["clear"][1] == "table, obstacles may leave" and rows["clear"][-1] == "counted in another way"
     assert rows["pretrained"][2] == "pinhole, sensor d455" and rows["pretrained"][-1].startswith("+25 points")
+
+
+def test_others_are_compared_with_the_policy_alone(tmp_path: Path) -> None:
+    """Not with its search, though that saw through the same camera, and no row with itself."""
+    run = read_run(write_run(tmp_path / "mine"))
+    own, other = [0, 0, 1, 0] * 10, [1, 1, 0, 0] * 10
+    files = [
+        write_evaluation(tmp_path / "alone.json", "runs/mine", own, camera="pinhole"),
+        write_evaluation(tmp_path / "planned.json", "runs/mine", [1] * 40, planning={"depth": 2}),
+        write_evaluation(tmp_path / "straight.json", "straight", other),
+    ]
+    alone, planned, straight = load_evaluations(run, files)
+    mine = of_run(run, [alone, planned, straight])
+    assert _paired(mine, straight).startswith("\N{MINUS SIGN}25 points")
+    assert _paired(mine, planned).startswith("\N{MINUS SIGN}75 points") and _paired([planned], planned) == ""
 
 
 def test_files_named_on_the_command_line_replace_those_of_the_folder(run_dir: Path, tmp_path: Path) -> None:

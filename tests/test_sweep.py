@@ -19,14 +19,14 @@ from PIL import Image
 
 from pregrasp_jax import yaml_file
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.sweep import driver, state
+from pregrasp_jax.sweep import driver, state, table
 from pregrasp_jax.sweep.driver import Driver
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.launchers import Launcher, LocalLauncher, Slot
 from pregrasp_jax.sweep.page import write_page
 from pregrasp_jax.sweep.spec import Spec, spec_from
 from pregrasp_jax.sweep.state import Job, TrialState
-from pregrasp_jax.sweep.table import make_table
+from pregrasp_jax.sweep.table import Row, make_table, tested
 from pregrasp_jax.sweep.table_files import format_table
 from pregrasp_jax.sweep.trials import evaluation_files
 from pregrasp_jax.sweep.worker import Worker, environment, measured
@@ -180,6 +180,20 @@ def test_a_browser_shows_the_page_and_finds_nothing_wrong_with_it(halved, tmp_pa
     assert dumped.count('class="curve s0 wide"') >= 1 and "Differences within" in dumped
     image = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3)
     assert len(np.unique(image, axis=0)) > 50, "there is something to see"
+
+
+def test_settings_that_met_other_scenes_or_another_place_are_not_compared():
+    def row(label: str, **changes: Any) -> Row:
+        rows = [{"scene": i, "target": "mug", "success": bool(i % 2)} for i in range(10)]
+        document = {"scene_bank_hash": "s", "hull_bank_hash": "h", "object_set": "seen", "mean_motions": 2.0}
+        tests = {"test": tested([{**document, "rows": rows, **changes}])}
+        about: dict[str, Any] = dict.fromkeys(("interval", "motions"))
+        return Row(rank=1, label=label, varied={}, members=(), words=(), scores=(), tests=tests, **about)
+
+    changed = {"scene_bank_hash": "z"}, {"object_set": "unseen"}, {"workspace": "shelf"}, {"hull_bank_hash": "z"}
+    others = [row(f"other {i}", **change) for i, change in enumerate(changed)]
+    found = table._differences(row("best"), [row("alike"), *others])
+    assert list(found["test"]) == ["alike"]
 
 
 def test_the_page_has_minus_signs_before_numbers_only(halved, tmp_path, monkeypatch):
