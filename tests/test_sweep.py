@@ -19,17 +19,17 @@ from PIL import Image
 
 from pregrasp_jax import yaml_file
 from pregrasp_jax.cli.main import main
-from pregrasp_jax.sweep import driver, state, table
+from pregrasp_jax.sweep import driver, state
 from pregrasp_jax.sweep.driver import Driver
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.launchers import Launcher, LocalLauncher, Slot
 from pregrasp_jax.sweep.page import write_page
 from pregrasp_jax.sweep.spec import Spec, spec_from
 from pregrasp_jax.sweep.state import Job, TrialState
-from pregrasp_jax.sweep.table import Row, make_table, tested
+from pregrasp_jax.sweep.table import make_table
 from pregrasp_jax.sweep.table_files import format_table
 from pregrasp_jax.sweep.trials import evaluation_files
-from pregrasp_jax.sweep.worker import Worker, environment, measured
+from pregrasp_jax.sweep.worker import Worker, environment
 
 STUB = Path(__file__).parent / "stub_trainer.py"
 LENGTH, LONG = 400, 1500
@@ -182,20 +182,6 @@ def test_a_browser_shows_the_page_and_finds_nothing_wrong_with_it(halved, tmp_pa
     assert len(np.unique(image, axis=0)) > 50, "there is something to see"
 
 
-def test_settings_that_met_other_scenes_or_another_place_are_not_compared():
-    def row(label: str, **changes: Any) -> Row:
-        rows = [{"scene": i, "target": "mug", "success": bool(i % 2)} for i in range(10)]
-        document = {"scene_bank_hash": "s", "hull_bank_hash": "h", "object_set": "seen", "mean_motions": 2.0}
-        tests = {"test": tested([{**document, "rows": rows, **changes}])}
-        about: dict[str, Any] = dict.fromkeys(("interval", "motions"))
-        return Row(rank=1, label=label, varied={}, members=(), words=(), scores=(), tests=tests, **about)
-
-    changed = {"scene_bank_hash": "z"}, {"object_set": "unseen"}, {"workspace": "shelf"}, {"hull_bank_hash": "z"}
-    others = [row(f"other {i}", **change) for i, change in enumerate(changed)]
-    found = table._differences(row("best"), [row("alike"), *others])
-    assert list(found["test"]) == ["alike"]
-
-
 def test_the_page_has_minus_signs_before_numbers_only(halved, tmp_path, monkeypatch):
     folder, spec, _ = halved
     note = "seen: no-her, rate=1e-05 minus all-on = -1.5 points, 95 % interval -3.0 to +0.1"
@@ -317,48 +303,6 @@ def test_refused_is_not_tried_again_and_crashed_is_and_the_sweep_goes_on(tmp_pat
     assert drive(folder, spec, again) == 1 and [job.trial for job in again.order] == [found[0.05].trial]
 
 
-def test_tpe_asks_for_what_looks_good_and_forgets_nothing_when_it_goes_on(tmp_path):
-    pytest.importorskip("optuna")
-    search = {"method": "tpe", "trials": 7}
-    parameters = {"learner.learning_rate": {"log": [1e-4, 1e-2]}, "task.max_pushes": {"int": [3, 9]}}
-    small = {"train.env_steps": 100, "train.minutes": 0, "train.evaluate_every": 100}
-    spec = make_spec(search=search, parameters=parameters, set=small)
-    folder = SweepFolder.create(tmp_path / "sweep", spec)
-
-    class Killed(Exception):
-        pass
-
-    def dies(job: Job) -> int | None:
-        if job.trial.number == 4:
-            raise Killed
-        return None
-
-    with pytest.raises(Killed):
-        drive(folder, spec, Here(folder, spec, code=dies))
-    assert drive(folder, spec, Here(folder, spec)) == 0
-    states = assert_whole(folder, length=100)
-    assert len(states) == len({known.trial.group for known in states}) == 7
-    import optuna
-
-    study = driver.Study(folder.path, spec)._study
-    told = {t.number: t.value for t in study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))}
-    assert {known.trial.proposal: known.score for known in states}.items() >= told.items() and len(told) >= 6
-    assert not [known for known in states if not 3 <= known.trial.settings["task.max_pushes"] <= 9]
-
-
-def test_tpe_ends_when_it_has_proposed_every_setting_there_is(tmp_path):
-    pytest.importorskip("optuna")
-    search, small = {"method": "tpe", "trials": 7}, {"train.env_steps": 100, "train.minutes": 0}
-    spec = make_spec(search=search, parameters={"task.max_pushes": {"int": [3, 4]}}, set=small)
-    folder = SweepFolder.create(tmp_path / "sweep", spec)
-    assert drive(folder, spec, Here(folder, spec)) == 0
-    assert len(folder.states()) == 2
-    study = driver.Study(folder.path, spec)
-    assert study.propose(folder.states()) == (None, -1)
-    asked = len(study._study.trials)
-    assert study.propose(folder.states()) == (None, -1) and len(study._study.trials) == asked, "it is not asked again"
-
-
 def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
     spec = make_spec(parameters=None)
     folder = SweepFolder.create(tmp_path / "sweep", spec)
@@ -390,17 +334,3 @@ def test_several_trials_share_a_gpu(tmp_path):
     wait_for(lambda: bool(launcher.ended()))
     (session,) = sessions(folder, folder.states()[0])
     assert session["gpu"] == "1" and session["share"] == "0.225"
-
-
-def test_a_score_is_the_best_up_to_the_rung():
-    rows = [
-        {"env_steps": 100, "eval/success_rate": 0.5, "eval/mean_motions": 2.0},
-        {"env_steps": 150, "train/loss": 1.0},
-        {"env_steps": 208, "eval/success_rate": 0.4, "eval/mean_motions": 3.0},
-        {"env_steps": 300, "eval/success_rate": 0.9, "eval/mean_motions": None},
-    ]
-    metric = "eval/success_rate"
-    assert measured(rows, metric, 200) == {"score": 0.5, "motions": 2.0, "env_steps": 300}
-    assert measured(rows, metric, 400)["score"] is None
-    assert measured(rows, metric, None) == {"score": 0.9, "motions": None, "env_steps": 300}
-    assert measured([], metric, None) == {"score": None, "motions": None, "env_steps": 0}
