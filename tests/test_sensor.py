@@ -3,11 +3,14 @@
 import dataclasses
 import functools
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fake_training import make_config
 from heightmap_oracle import box_cloud, make_instances
 
 from pregrasp_jax import heightmap
@@ -16,6 +19,8 @@ from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.heightmap import sensor
 from pregrasp_jax.heightmap.views import project_upward
 from pregrasp_jax.sensors import SENSORS, Sensor, camera_sensor, get_sensor
+from pregrasp_jax.training import session
+from pregrasp_jax.training.run_folder import RunFolder
 from pregrasp_jax.types import ROBOT_ID
 
 KEY = jax.random.key(0)
@@ -42,6 +47,22 @@ def test_names_and_files(tmp_path: Path):
     with pytest.raises(ValueError, match="allowed with it is pinhole"):
         camera_sensor("d435", "orthographic")
     assert camera_sensor("d435", "pinhole") == SENSORS["d435"]
+
+
+def test_a_run_is_not_resumed_once_its_sensor_file_says_something_else(tmp_path: Path):
+    file, config = tmp_path / "mine.yaml", make_config()
+    with RunFolder.create(tmp_path / "run", config) as folder:
+        for text in ("drop: 0.1", "drop: 0.10  # the same"):
+            file.write_text(text)
+            folder.begin_session(config, session._hashes(_env_seen_by(get_sensor(str(file)))))
+        file.write_text("drop: 0.2")
+        with pytest.raises(ValueError, match=r"began with another sensor \(\w+, now \w+\)"):
+            folder.begin_session(config, session._hashes(_env_seen_by(get_sensor(str(file)))))
+
+
+def _env_seen_by(sensor: Sensor) -> Any:
+    part = SimpleNamespace(content_hash="same")
+    return SimpleNamespace(sensor=sensor, bank=part, scenes=part, workspace=part)
 
 
 @pytest.mark.parametrize("cell", ["max", "second", "median"])

@@ -125,7 +125,8 @@ class RunFolder:
         """Record configuration, versions, machine and hashes; call it before anything else is written.
 
         Raises:
-            ValueError: the run began with other objects or scenes or in another place, or its manifest is damaged.
+            ValueError: the run began with other objects or scenes, in another place or with another sensor, or its
+                manifest is damaged.
         """
         manifest = read_manifest(self.path) or {"hashes": hashes, "sessions": []}
         then = manifest["hashes"]
@@ -133,8 +134,8 @@ class RunFolder:
             if then.get(name) != hashes.get(name):
                 raise ValueError(
                     f"run {self.path} began with another {name} ({then.get(name)}, now {hashes.get(name)}); resume it "
-                    "with the same objects, place, MuJoCo and package version; --init-from starts a new run from its "
-                    "parameters"
+                    "with the same objects, place, sensor, MuJoCo and package version; --init-from starts a new run "
+                    "from its parameters"
                 )
         if difference(stored_config(self.path), config):
             write_config(self.path / CONFIG, config)

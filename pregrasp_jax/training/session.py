@@ -15,6 +15,7 @@ from pregrasp_jax.evaluation import Evaluator
 from pregrasp_jax.evaluation.clearing import own_protocol
 from pregrasp_jax.learning.q_function import Params, make_q_function
 from pregrasp_jax.policies.learned import make_learned
+from pregrasp_jax.sensors import CLEAN
 from pregrasp_jax.settings import flatten, to_dict
 from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.assembly import make_env
@@ -118,7 +119,7 @@ def _learn_q(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
     validation = _load(config, "validation", console)
     program = make_program(env, config, params=params, layout=layout)
     resources.check(*program.shapes().split(), run_dir)
-    hashes = _hashes(env, validation)
+    hashes = _hashes(env) | {"validation scenes": validation.scenes.content_hash}
     processes.refuse_difference(_digest(config, hashes))
     resumed, folder = folder is not None, folder or _create(run_dir, config)
     evaluate, compile_evaluation = make_evaluate(validation, config)
@@ -221,7 +222,7 @@ def _imitate(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
     resumed = folder is not None
     env = own_protocol(_load(config, "train", console))
     folder = folder or _create(run_dir, config)
-    hashes = {"hull bank": env.bank.content_hash, "training scenes": env.scenes.content_hash}
+    hashes = _hashes(env)
     with folder, Interrupt(console.say, console.close) as interrupt:
         folder.begin_session(config, hashes)
         try:
@@ -270,10 +271,11 @@ def _digest(config: Config, hashes: dict[str, str]) -> str:
     return io.content_hash(to_dict(dataclasses.replace(config, assets=somewhere)), hashes)
 
 
-def _hashes(env: Env, validation: Env) -> dict[str, str]:
-    return {
+def _hashes(env: Env) -> dict[str, str]:
+    """Return what a run keeps for as long as it goes on; a sensor may be a file, which somebody may change."""
+    sensor = {} if env.sensor == CLEAN else {"sensor": io.content_hash(dataclasses.asdict(env.sensor))}
+    return sensor | {
         "hull bank": env.bank.content_hash,
         "training scenes": env.scenes.content_hash,
-        "validation scenes": validation.scenes.content_hash,
         "workspace": env.workspace.content_hash,
     }
