@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pregrasp_jax.config import TaskConfig
+from pregrasp_jax.sensors import CLEAN, Sensor
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace, Choice
 from pregrasp_jax.spaces.workspace import TABLE, Workspace
@@ -116,6 +117,7 @@ class FakeEnv:
     eligible: Any = field(default_factory=lambda: np.array([True, True, False]))
     engine: Any = field(default_factory=make_engine)
     workspace: Workspace = TABLE
+    sensor: Sensor = CLEAN
     symmetric: bool = True
 
     @functools.cached_property

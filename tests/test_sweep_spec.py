@@ -174,6 +174,19 @@ def test_a_key_that_stands_twice_is_refused_with_its_line(tmp_path, capsys):
     assert "line 2: 'train.minutes' stands here and in line 2" in capsys.readouterr().err
 
 
+def test_what_cannot_work_is_said_with_its_file(tmp_path, capsys):
+    file = tmp_path / "spec.yaml"
+    file.write_bytes(yaml_file.dump(changed(seeds=[0, 0])))
+    with pytest.raises(SystemExit):
+        main(["sweep", "start", str(file), "--dir", str(tmp_path / "sweep")])
+    assert capsys.readouterr().err.startswith(f"error: {file}: seeds")
+    folder = SweepFolder.create(tmp_path / "begun", spec_from(FULL))
+    (folder.path / "spec.yaml").write_bytes(yaml_file.dump(changed(resources={"cores": 0})))
+    with pytest.raises(SystemExit):
+        main(["sweep", "resume", str(folder.path)])
+    assert capsys.readouterr().err.startswith(f"error: {folder.path / 'spec.yaml'}: resources")
+
+
 def test_a_dry_run_says_what_would_be_done_and_does_nothing(tmp_path, capsys):
     (tmp_path / "spec.yaml").write_bytes(yaml_file.dump(changed(resources={"memory_gb": 0.01})))
     main(["sweep", "start", str(tmp_path / "spec.yaml"), "--dir", str(tmp_path / "s"), "--parallel", "1",

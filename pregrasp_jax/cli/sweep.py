@@ -11,7 +11,7 @@ from pregrasp_jax.cli.command_line import deferred
 from pregrasp_jax.sweep import checks, driver, slurm, table
 from pregrasp_jax.sweep.driver import Driver
 from pregrasp_jax.sweep.estimate import describe, memory_of
-from pregrasp_jax.sweep.folder import SweepFolder
+from pregrasp_jax.sweep.folder import SPEC, SweepFolder
 from pregrasp_jax.sweep.launchers import Launcher, LocalLauncher
 from pregrasp_jax.sweep.ray_launcher import RayLauncher, require_ray
 from pregrasp_jax.sweep.spec import PROGRAM, Spec, read_spec
@@ -49,7 +49,7 @@ def start(
         dry_run: check everything, say what would be done, and do nothing.
     """
     read = read_spec(spec)
-    check(read, launcher=launcher, parallel=parallel, names=dry_run)
+    check(read, launcher=launcher, parallel=parallel, names=dry_run, file=spec)
     SweepFolder.refuse_used(dir)
     for line in describe(read, launcher=launcher, parallel=parallel):
         print(line, flush=True)
@@ -71,7 +71,7 @@ def resume(
     """
     opened = SweepFolder.open(folder)
     spec = opened.spec()
-    check(spec, launcher=launcher, parallel=parallel, here=opened.cwd)
+    check(spec, launcher=launcher, parallel=parallel, file=opened.path / SPEC, here=opened.cwd)
     with opened.drive():  # what another driver was asked to do is not taken back
         opened.ask_to_stop(False)
         for failed in [s for s in opened.states() if retry and s.failed]:
@@ -169,7 +169,13 @@ def worker(
 
 
 def check(
-    spec: Spec, *, launcher: LauncherName, parallel: int | None, names: bool = False, here: Path = Path()
+    spec: Spec,
+    *,
+    launcher: LauncherName,
+    parallel: int | None,
+    names: bool = False,
+    file: Path | None = None,
+    here: Path = Path(),
 ) -> None:
     """Refuse what cannot work, before anything is written.
 
@@ -178,6 +184,7 @@ def check(
         launcher: its own needs are looked at, too.
         parallel: trials at a time, None for as many as fit.
         names: whether to check those that only the registries know, which takes JAX.
+        file: that the sweep was read from, which errors name.
         here: folder that relative paths refer to.
 
     Raises:
@@ -185,17 +192,20 @@ def check(
     """
     if parallel is not None and parallel < 1:
         raise ValueError(f"parallel = {parallel} is out of range; allowed is 1 and more")
-    checks.check(spec, here=here)
     if spec.search.method == "tpe":
         require_optuna()
     if launcher == "ray":
         require_ray()
-    elif launcher == "slurm":
-        slurm.check(spec)
-    if names and spec.program == PROGRAM:
-        from pregrasp_jax.sweep.names import check_names
+    try:
+        checks.check(spec, here=here)
+        if launcher == "slurm":
+            slurm.check(spec)
+        if names and spec.program == PROGRAM:
+            from pregrasp_jax.sweep.names import check_names
 
-        check_names(spec, here=here)
+            check_names(spec, here=here)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}" if file else str(error)) from None
 
 
 def drive(folder: SweepFolder, spec: Spec, *, launcher: LauncherName, parallel: int | None) -> int:
