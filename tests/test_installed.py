@@ -110,15 +110,14 @@ def test_the_citation_is_of_this_version_and_names_the_paper():
     ids=lambda kind: f"{kind}_dependencies",
 )
 def test_the_wheel_trains_and_evaluates_without_the_checkout(built: Built, tmp_path: Path, dependencies: str):
-    """In an empty environment, whose dependencies are those of this one or are installed anew."""
+    """In an empty environment, whose dependencies and caches are those of this one, or new."""
     program = _install(built.wheel, tmp_path / "environment", borrow=dependencies == "borrowed")
     away = tmp_path / "away"
     away.mkdir()
-    cache = {"PREGRASP_JAX_CACHE": str(tmp_path / "cache")}
     if dependencies == "borrowed":
-        cache |= {"JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"]}
+        cache = {"JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"]}
     else:
-        cache |= {"JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
+        cache = {"PREGRASP_JAX_CACHE": str(tmp_path / "cache"), "JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
     assert run(program, "--version", cwd=away) == f"pregrasp-jax {pregrasp_jax.__version__}\n"
     where = run(program.parent / "python", "-c", "import pregrasp_jax; print(pregrasp_jax.__file__)", cwd=away)
     assert Path(where).is_relative_to(tmp_path / "environment")

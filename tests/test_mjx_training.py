@@ -94,6 +94,7 @@ def built() -> Built:
     return Built(make_program(make_env(NUM_SLOTS, FEW, traces)), traces)
 
 
+@pytest.mark.slow
 def test_the_iteration_stays_on_an_accelerator(built):
     assert host_calls(built.program, "cuda", "tpu") == []
 
