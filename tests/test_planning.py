@@ -28,7 +28,9 @@ from pregrasp_jax.planning import planner
 from pregrasp_jax.planning.memory import NOTHING, Sight
 from pregrasp_jax.planning.planner import Planned, Planner, spread_best
 from pregrasp_jax.planning.promise import promise_of
+from pregrasp_jax.planning.rollout import Rollout
 from pregrasp_jax.planning.search import Choice
+from pregrasp_jax.planning.simulation import make_simulations
 from pregrasp_jax.robot.base import hand_pose_of
 from pregrasp_jax.task.assembly import make_env, with_task
 from pregrasp_jax.types import EnvState, Observation, PhysicsObservation, SceneParams
@@ -181,6 +183,22 @@ def test_rebuilt_scenes_are_drawn_and_valued_as_in_training(discount: float, mon
     assert (through_pinhole.task.camera, through_pinhole.task.sensor) == ("orthographic", "clean")
     assert above["camera_m"] is None and about["camera_m"].shape == (3,) and about["camera_m"][2] > 0.9
     assert about["promise"] == promise_of(trained.config.task, discount) and about["threads"] == 1
+
+
+def test_mirror_images_count_for_the_real_picture_and_for_no_rebuilt_one():
+    policy = load_policy("cpu-1")
+    env = make_env(dataclasses.replace(policy.config, scene=SceneConfig(test_scenes=2)), split="test", threads=1)
+    both = make_q_function(policy.config.network, policy.config.task, env.primitive.actions)
+    simulations = make_simulations(env.robot, env.workspace, num_variants=1, threads=1)
+    rollout = Rollout(env, simulations, both, policy.params, batch=1)
+    state = jax.device_get(env.reset_to(jnp.int32(0)))
+    best = []
+    for q_function in (both, dataclasses.replace(both, mirror_fn=None)):
+        values = jax.jit(q_function.values)(policy.params, state.obs, state.scene.target)
+        best.append(float(values[env.action_mask(state.hand)].max()))
+    assert abs(best[0] - best[1]) > 1e-3
+    assert rollout.values(state.obs, state.scene.target).max() == pytest.approx(best[0], abs=1e-5)
+    assert rollout.propose([state]).values.tolist() == pytest.approx(best[1:], abs=1e-5)
 
 
 @pytest.mark.slow

@@ -148,6 +148,17 @@ def test_without_time_one_round_decides():
     assert world.pushes == 5 and world.calls == 2
 
 
+@pytest.mark.parametrize(("seconds", "pushes"), [(17.9, 12), (18.1, 18), (29.9, 18), (30.1, 24)])
+def test_a_round_begins_if_a_push_of_it_would_take_as_long_as_of_the_last(
+    seconds: float, pushes: int, monkeypatch: pytest.MonkeyPatch
+):
+    """A push takes a second here. Rounds make 12, 6 and 6, and the last one, which may try grasps, is taken for 12."""
+    world = World({})
+    monkeypatch.setattr(searching, "time", SimpleNamespace(perf_counter=lambda: float(world.pushes)))
+    decide(world, list(range(1, 13)), deadline=seconds, variants=6, depth=2)
+    assert world.pushes == pushes
+
+
 @pytest.mark.parametrize("approach", [0.5, 0.0])
 @pytest.mark.parametrize("discount", [0.5, 0.7, 0.85, 0.99])
 def test_chances_rise_with_values_and_are_in_rewards_of_a_success(approach: float, discount: float):

@@ -74,6 +74,7 @@ class Rollout:
         """
         self.batch = batch
         self._env, self._params, self._q = env, params, q_function
+        self._continuing = dataclasses.replace(q_function, mirror_fn=None)  # half the time, as many successes
         self._engine = engine_of(simulations, env.robot)
         self._num_velocities = simulations.model.mj_model.nv
         self._start = jax.jit(jax.vmap(self._start_one, (None, 0, 0, 0, None, None)))
@@ -112,7 +113,7 @@ class Rollout:
         return np.asarray(self._script(jax.tree.map(lambda leaf: leaf[0], roots), key)).tolist()
 
     def propose(self, states: Sequence[EnvState]) -> Proposed:
-        """Return what the network would push next in N >= 1 rebuilt scenes, as host arrays."""
+        """Return what the network would push next in N >= 1 rebuilt scenes, as host arrays; no mirror images count."""
         found = []
         for start in range(0, len(states), _ASKED):
             some = list(states[start : start + _ASKED])
@@ -180,8 +181,9 @@ class Rollout:
         return jnp.where(self._env.action_mask(obs.hand), self._q.values(params, obs, target), -jnp.inf)
 
     def _ask_some(self, params: Any, obs: Observation, targets: jax.Array) -> tuple[jax.Array, jax.Array]:
-        inputs = jax.vmap(self._q.input_fn)(obs, targets)
-        q = jnp.where(jax.vmap(self._env.action_mask)(obs.hand), self._q.apply(params, inputs), -jnp.inf)
+        inputs = jax.vmap(self._continuing.input_fn)(obs, targets)
+        allowed = jax.vmap(self._env.action_mask)(obs.hand)
+        q = jnp.where(allowed, self._continuing.apply(params, inputs), -jnp.inf)
         return q.max(axis=(1, 2, 3)), jax.vmap(self._next)(q)
 
     def _before_push(

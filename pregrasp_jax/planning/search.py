@@ -21,6 +21,9 @@ GRASPED = 2
 """Candidates that are left when grasps are tried: it takes long, nearly all that is enclosed is held, and what slips in
 one variant slips in most."""
 
+GRASP_WORK = 2
+"""How many times as long a round takes in which grasps are tried, too."""
+
 DISCOUNT = 0.93
 """What a success one push later is worth."""
 
@@ -107,15 +110,17 @@ def search(
         config: how deep, in how many variants.
         promise: what the values of the network mean.
         left: pushes that the episode may still have, the one that is searched for included.
-        deadline: by `time.perf_counter`; no round begins that would not end before it.
+        deadline: by `time.perf_counter`; no round begins that would not end before it if a push took as long as in
+            the last one.
     """
     trees: list[list[Node]] = [[] for _ in candidates]
-    best, last = list(range(len(candidates))), 0.0
+    best, seconds_per_push = list(range(len(candidates))), 0.0
     for number, keep in enumerate((len(candidates), *ROUNDS)):
         begin = time.perf_counter()
-        if number and begin + last > deadline:
-            break
         best = sorted(best, key=lambda c: -_mean_worth(trees[c]))[:keep]
+        work = len(best) * (1 + number) * (1 if len(best) > GRASPED else GRASP_WORK)
+        if number and begin + work * seconds_per_push > deadline:
+            break
         due = [n for c in best for n in _due(trees[c], candidates[c], roots, 1 + number, config, left)]
         batches = _batches(due, rollout.batch)
         # All are under way before the first is looked at: its pictures are drawn while the next is pushed.
@@ -125,7 +130,7 @@ def search(
             _look_ahead(rollout, going_on, promise, left)
         if len(best) <= GRASPED:
             _grasp_leader(rollout, bank, [trees[c] for c in best])
-        last = time.perf_counter() - begin
+        seconds_per_push = (time.perf_counter() - begin) / work
     pushes = sum(node.depth > 0 for of_candidate in trees for tree in of_candidate for node in tree.nodes())
     return Choice(candidates[max(best, key=lambda c: _mean_worth(trees[c]))], pushes)
 
