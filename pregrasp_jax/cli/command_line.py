@@ -5,7 +5,8 @@ import functools
 import io as text_io
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeVar
 
 from pregrasp_jax import io
@@ -33,6 +34,18 @@ def parse(parser: Callable[[], T]) -> T:
         if error.code:
             print(f"error: {unbox(complaint.getvalue())}", file=sys.stderr)
         raise
+
+
+def refuse_repeated(options: Sequence[str]) -> None:
+    """Refuse an option that is given more than once, in either spelling: tyro would drop all but the last.
+
+    Raises:
+        ValueError: the name, and how often it is there.
+    """
+    names = (option.partition("=")[0].replace("_", "-") for option in options if option.startswith("--"))
+    for name, times in Counter(names).items():
+        if times > 1:
+            raise ValueError(f"{name} is given {times} times; allowed is once")
 
 
 def deferred(function: Callable[..., int | None]) -> Callable[..., Callable[[], int | None]]:

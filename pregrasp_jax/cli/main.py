@@ -9,7 +9,7 @@ from typing import Any
 import tyro
 
 import pregrasp_jax
-from pregrasp_jax.cli.command_line import INTERRUPTED, deferred, one_line_errors, parse
+from pregrasp_jax.cli.command_line import INTERRUPTED, deferred, one_line_errors, parse, refuse_repeated
 
 PROGRAM = "pregrasp-jax"
 
@@ -91,10 +91,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _bind(command: Command, options: list[str], prog: str) -> Callable[[], int | None]:
     """Import a command and return its call with these options."""
     target = pkgutil.resolve_name(command.target)
-    if command.nested:
-        return _parse_nested(target(options), options, prog, command.summary)
     if command.aliases:
         options = _spelled_out(options, pkgutil.resolve_name(command.aliases))
+    refuse_repeated(options)
+    if command.nested:
+        return _parse_nested(target(options), options, prog, command.summary)
     return parse(lambda: tyro.cli(deferred(target), prog=prog, args=options, config=(tyro.conf.FlagConversionOff,)))
 
 
