@@ -117,6 +117,11 @@ def test_what_is_simulated_is_found_from_where_the_cell_is_written(tmp_path: Pat
         ({"target": {}}, "allowed is one of index, name and pixel"),
         ({"segmenter": {"kind": "file"}}, "segmenter.file is missing"),
         ({"camera": {"intrinsics": INTRINSICS, "depth": "depth.npy"}}, "camera.extrinsics is missing"),
+        (
+            {"robot": {"limits": {"high_m": [0.3, 0.3, 0.25]}}},
+            "no room to lift what is grasped; allowed is a third number",
+        ),
+        ({"robot": {"limits": {"step_m": 0.19}}}, "no room to lift what is grasped; allowed is a third number of 0.32"),
     ],
 )
 def test_what_a_cell_lacks_is_one_line(tmp_path: Path, sections: dict, said: str, capsys):

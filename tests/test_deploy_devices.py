@@ -41,6 +41,8 @@ def test_states_in_which_nothing_may_move():
         ({"safety_mode": 3}, "safety mode 3"),
         ({"tcp_pose": np.zeros(5)}, "six finite"),
         ({"tcp_pose": np.full(6, np.nan)}, "six finite"),
+        ({"joints": np.zeros(0)}, "six finite"),
+        ({"joints": np.full(6, np.nan)}, "six finite"),
         ({"force_n": 61.0}, "61 N"),
         ({"force_n": float("nan")}, "nan N"),
     ):
@@ -81,6 +83,10 @@ def test_a_dry_cell_says_what_it_would_send(decider: Decider):
     np.testing.assert_allclose(arm.joints(), push.joints[-1])
     assert not gripper.grasp()
     assert said[0] == "dry: gripper to 0%" and said[1].startswith("dry: moveL([") and "0.1 m/s" in said[1]
+    arm.lift(0.2)
+    assert said[-1] == "dry: lift by 0.2 m"
+    with pytest.raises(DeviceError, match="the box"):
+        arm.lift(0.4)
     with pytest.raises(DeviceError, match="speed"):
         DryArm(decider.body.arm, Limits(), np.zeros(6), speed=0.5, acceleration=0.5).push(push)
 
@@ -187,6 +193,10 @@ def test_pictures_are_taken_after_they_are_asked_for_and_masks_are_of_them(tmp_p
     threading.Timer(0.2, write).start()
     image, _, taken = source.capture()
     assert image[0, 0] == 2
+    ahead = time.time() + 60
+    os.utime(depth, (ahead, ahead))  # its writer's clock is, and it writes no more
+    with pytest.raises(DeviceError, match="no new depth image"):
+        source.capture()
     segmenter = FileSegmenter(ids, min_score=0.5, fresh=False, patience_s=0.5)
     frame: Any = SimpleNamespace(time_s=taken)
     with pytest.raises(DeviceError, match=r"no new file of masks in .*ids\.png"):

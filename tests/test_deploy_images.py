@@ -8,7 +8,7 @@ from bundles import SMALL
 
 from pregrasp_jax.deploy.camera import PinholeCamera, depth_in_metres
 from pregrasp_jax.deploy.files import masks_of_ids, read_masks
-from pregrasp_jax.deploy.masks import Masks, Target, from_mask_rcnn, fuse
+from pregrasp_jax.deploy.masks import Masks, Target, from_mask_rcnn, fuse, refuse_size
 from pregrasp_jax.deploy.tabletop import components
 from pregrasp_jax.deploy.view import make_view
 
@@ -123,7 +123,7 @@ def detections(count: int = 3) -> dict:
 def test_mask_rcnn_as_torchvision_gives_it():
     masks = from_mask_rcnn([detections()], {44: "bottle", 47: "cup"})
     assert masks.names == ("bottle", "cup") and masks.masks.dtype == bool, "the third is not sure enough"
-    image = fuse(masks, 1, SMALL.bundle.contract.grid.labels, (40, 40))
+    image = fuse(masks, 1, SMALL.bundle.contract.grid.labels)
     assert image[12, 10] == SMALL.bundle.contract.grid.labels["obstacle"], "where they overlap the surer one counts"
     assert (
         image[15, 10] == SMALL.bundle.contract.grid.labels["target"]
@@ -151,10 +151,10 @@ def test_targets_and_masks_that_are_not_there_are_refused(tmp_path: Path):
     with pytest.raises(ValueError, match="allowed is one of"):
         Target(index=1, name="mug")
     with pytest.raises(ValueError, match="allowed is N x 30 x 40"):
-        fuse(masks, 0, SMALL.bundle.contract.grid.labels, (30, 40))
+        refuse_size(masks, (30, 40))
     hidden = Masks(np.stack([masks.masks[0], masks.masks[0]]), ("a", "b"), np.array([0.9, 0.8]))
     with pytest.raises(ValueError, match="0 visible pixels"):
-        fuse(hidden, 1, SMALL.bundle.contract.grid.labels, (40, 40))
+        fuse(hidden, 1, SMALL.bundle.contract.grid.labels)
     for output in ([], {"labels": [1]}, {"labels": [1], "masks": np.zeros((2, 3, 4, 5))}):
         with pytest.raises(ValueError, match="Mask R-CNN"):
             from_mask_rcnn(output)

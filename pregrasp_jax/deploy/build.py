@@ -15,6 +15,7 @@ from pregrasp_jax.deploy.decision import Decider, workspace_of
 from pregrasp_jax.deploy.devices import ArmDriver, GripperDriver, Segmenter
 from pregrasp_jax.deploy.drivers.dry import DryArm, DryGripper
 from pregrasp_jax.deploy.files import FileSegmenter, FileSource
+from pregrasp_jax.deploy.guard import refuse_lift
 from pregrasp_jax.deploy.log import DecisionLog
 from pregrasp_jax.deploy.loop import Station
 from pregrasp_jax.deploy.policy import load_values
@@ -111,6 +112,8 @@ def make_station(
 
 def _arm(cell: Cell, decider: Decider, kind: ArmKind, say: Say) -> ArmDriver:
     contract, limits = decider.contract, cell.robot.limits
+    if contract.end is not None:
+        refuse_lift(limits, max(choice.z_m for choice in contract.action.choices))
     speed = contract.action.push_speed_m_s if cell.robot.speed_m_s is None else cell.robot.speed_m_s
     if kind == "dry":
         acceleration = cell.robot.acceleration_m_s2

@@ -23,8 +23,8 @@ class FileSource:
         Args:
             depth: .npy, or .png of 16 bits.
             color: .png; None without one.
-            fresh: an image must be written after it is asked for: the arm may have moved before. Otherwise any that has
-                not been read will do.
+            fresh: an image must be written after it is asked for: the arm may have moved before. One that lies there
+                already is not, whatever its writer's clock says. Otherwise any that has not been read will do.
             patience_s: how long such an image is waited for.
         """
         self._depth, self._color, self._patience = depth, color, patience_s
@@ -32,8 +32,12 @@ class FileSource:
 
     def capture(self) -> tuple[np.ndarray, np.ndarray | None, float]:
         """Return the newest image; see `ImageSource.capture`."""
-        after = time.time() if self._fresh else self._last
-        self._last = _wait(self._depth, lambda written: written > after, "depth image", self._patience)
+        after, there = (time.time(), _written(self._depth)) if self._fresh else (self._last, None)
+
+        def is_new(written: float) -> bool:
+            return written > after and written != there
+
+        self._last = _wait(self._depth, is_new, "depth image", self._patience)
         color = read_image(self._color) if self._color else None
         return read_depth(self._depth), color, self._last
 
@@ -68,10 +72,15 @@ class FileSegmenter:
         return _wait(self._path, is_new, "file of masks", self._patience)
 
 
+def _written(path: Path) -> float | None:
+    """Return when a file has been written, s since 1970; None if it is not there."""
+    return path.stat().st_mtime if path.is_file() else None
+
+
 def _wait(path: Path, is_new: Callable[[float], bool], what: str, patience_s: float) -> float:
     """Wait until a file has been written anew, and return when that was, s since 1970."""
     begun = time.monotonic()
-    while not (path.is_file() and is_new(written := path.stat().st_mtime)):
+    while (written := _written(path)) is None or not is_new(written):
         if time.monotonic() - begun > patience_s:
             raise DeviceError(f"no new {what} in {path} for {patience_s:g} s; is its writer running?")
         time.sleep(0.02)

@@ -11,6 +11,9 @@ NORMAL = 1
 
 REDUCED = 2
 
+LIFT_HEIGHT = 0.2
+"""m; how far a hand goes up after its fingers have closed."""
+
 START_ERROR = 0.02
 """m; a push starts where the last one was commanded to end, within this."""
 
@@ -87,7 +90,7 @@ def refuse_state(state: ArmState, limits: Limits) -> None:
             f"the arm is in a protective stop or not in normal mode (safety mode {state.safety_mode}); a person has to "
             "look why, and release it on the pendant"
         )
-    if state.tcp_pose.shape != (6,) or not np.isfinite(state.tcp_pose).all() or not np.isfinite(state.joints).all():
+    if any(values.shape != (6,) or not np.isfinite(values).all() for values in (state.tcp_pose, state.joints)):
         raise DeviceError("the arm's pose or joints are not six finite numbers")
     if not state.force_n <= limits.force_n:
         raise DeviceError(f"the tool is pushed with {state.force_n:.0f} N; allowed is {limits.force_n:g} N")
@@ -123,6 +126,24 @@ def refuse_motion(start: np.ndarray, end: np.ndarray, *, speed: float, accelerat
         raise DeviceError(f"a motion's speed is {speed:g} m/s; allowed is above 0 to {limits.speed_m_s:g}")
     if not 0 < acceleration <= limits.acceleration_m_s2:
         raise DeviceError(f"a motion's acceleration is {acceleration:g} m/s^2; allowed is {limits.acceleration_m_s2:g}")
+
+
+def refuse_lift(limits: Limits, height_m: float) -> None:
+    """Refuse limits in which what is grasped could not be lifted: better before a trial than with the fingers closed.
+
+    Args:
+        limits: that hold.
+        height_m: of the grasp point above the table, when the fingers close.
+
+    Raises:
+        ValueError: the box is too low, or the longest motion too short.
+    """
+    highest = height_m + LIFT_HEIGHT + START_ERROR
+    if limits.high_m[2] < highest or limits.step_m < LIFT_HEIGHT:
+        raise ValueError(
+            f"robot.limits.high_m = {list(limits.high_m)} and step_m = {limits.step_m:g} leave no room to lift what is "
+            f"grasped; allowed is a third number of {highest:g} and more, and step_m of {LIFT_HEIGHT:g} and more"
+        )
 
 
 def refuse_pose(pose: object) -> list[float]:

@@ -1,7 +1,9 @@
 """Every decision on disk with all that it followed from, so that a failed trial can be looked at, and drawn.
 
 LOG/decision-003.npz    depth, labels, joints, hand; both maps, q, allowed pushes
-LOG/decision-003.json   the push, what was refused, coverage, times; what came of it
+LOG/decision-003.json   the push, what was refused, coverage, times
+LOG/undecided-003.npz   depth and joints of an image that could not be used
+LOG/result.json         how the trial ended, or the error that ended it
 """
 
 import json
@@ -32,7 +34,7 @@ class DecisionLog:
             ValueError: it cannot be written, or holds the decisions of another trial.
         """
         io.refuse_unwritable(folder / "decision")
-        if folder.is_dir() and any(folder.glob("decision-*")):
+        if folder.is_dir() and any(path for kind in ("decision", "undecided") for path in folder.glob(f"{kind}-*")):
             raise ValueError(f"{folder} holds the decisions of an earlier trial; allowed is a new folder")
         folder.mkdir(parents=True, exist_ok=True)
         self._folder, self._contract = folder, contract
@@ -54,9 +56,7 @@ class DecisionLog:
         arrays = {"depth": frame.depth, "labels": labels, "joint_pos": frame.joint_pos, "allowed": decision.allowed}
         arrays |= {"hand": np.array([*hand.xy, hand.z, hand.yaw, hand.aperture]), "q": q}
         arrays |= {"height_m": maps.height_m, "map_labels": maps.labels}
-        if frame.color is not None:
-            arrays["color"] = frame.color
-        io.write_npz(self._folder / f"{name}.npz", **arrays)
+        io.write_npz(self._folder / f"{name}.npz", **arrays, **_color(frame))
         push = decision.push
         choices = self._contract.action.choices
         about = {
@@ -87,9 +87,18 @@ class DecisionLog:
         }
         io.write_json(self._folder / f"{name}.json", about)
 
+    def keep(self, number: int, frame: Frame) -> None:
+        """Write an image from which decision `number` could not be made."""
+        arrays = {"depth": frame.depth, "joint_pos": frame.joint_pos, **_color(frame)}
+        io.write_npz(self._folder / f"undecided-{number:03d}.npz", **arrays)
+
     def conclude(self, result: Mapping[str, Any]) -> None:
         """Write how the trial ended."""
         io.write_json(self._folder / "result.json", dict(result))
+
+
+def _color(frame: Frame) -> dict[str, np.ndarray]:
+    return {} if frame.color is None else {"color": frame.color}
 
 
 def draw_log(folder: Path) -> list[Path]:

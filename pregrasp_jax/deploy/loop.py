@@ -2,25 +2,25 @@
 
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pregrasp_jax.deploy.camera import depth_in_metres
 from pregrasp_jax.deploy.decision import Decider, Decision
-from pregrasp_jax.deploy.devices import ArmDriver, Frame, GripperDriver, ImageSource, Segmenter
+from pregrasp_jax.deploy.devices import ArmDriver, DeviceError, Frame, GripperDriver, ImageSource, Segmenter
+from pregrasp_jax.deploy.guard import LIFT_HEIGHT
 from pregrasp_jax.deploy.log import DecisionLog
-from pregrasp_jax.deploy.masks import ROBOT, Target, fuse, instance_image
+from pregrasp_jax.deploy.masks import ROBOT, Target, fuse, instance_image, refuse_size
 from pregrasp_jax.deploy.projection import Maps, draw_robot, to_maps
 from pregrasp_jax.deploy.search import Search, Seen
+from pregrasp_jax.deploy.tracking import Known, find_target, things_of
 from pregrasp_jax.deploy.view import View
+from pregrasp_jax.messages import one_line
 from pregrasp_jax.sensors import PointOfCell
 from pregrasp_jax.spaces import motion
-
-LIFT_HEIGHT = 0.2
-"""m, after the fingers have closed."""
 
 
 class Looked(NamedTuple):
@@ -32,6 +32,7 @@ class Looked(NamedTuple):
         maps: what the policy read.
         decision: what to do.
         times_ms: what took how long, by name.
+        known: the objects, by which the next look finds the target.
     """
 
     frame: Frame
@@ -39,6 +40,7 @@ class Looked(NamedTuple):
     maps: Maps
     decision: Decision
     times_ms: dict[str, float]
+    known: Known
 
 
 class Result(NamedTuple):
@@ -92,21 +94,31 @@ class Station:
             DeviceError: a device cannot go on; nothing is retried.
             ValueError: an image, a mask or a joint cannot be used.
         """
+        try:
+            result = self._trial(once=once)
+        except (DeviceError, ValueError) as error:
+            self._conclude({"reason": "error", "error": one_line(error)})
+            raise
+        self._conclude(result._asdict())
+        self.say(f"{result.reason.replace('_', ' ')} after {result.pushes} pushes")
+        return result
+
+    def _trial(self, *, once: bool) -> Result:
         entry = self.decider.contract.action
-        hand, pushes = self.decider.start(), 0
+        hand, pushes, known = self.decider.start(), 0, None
         while True:
-            looked = self.look(hand, pushes=pushes)
+            looked = self.look(hand, pushes=pushes, known=known)
             self._write(pushes, looked, hand)
             decision = looked.decision
             if decision.close:
                 self.say(f"the target is enclosed ({decision.coverage:.0%}): closing")
                 held = self.gripper.grasp()
                 self.arm.lift(LIFT_HEIGHT)
-                return self._end("grasped" if held else "not_held", pushes)
+                return Result("grasped" if held else "not_held", pushes)
             if decision.push is None:
-                return self._end("no_push", pushes)
+                return Result("no_push", pushes)
             if pushes >= entry.max_pushes:
-                return self._end("max_pushes", pushes)
+                return Result("max_pushes", pushes)
             push, choice = decision.push, entry.choices[decision.push.choice]
             x, y, z = push.poses[-1, :3]
             self.say(
@@ -115,26 +127,41 @@ class Station:
             )
             self.gripper.move(choice.opening)
             self.arm.push(push)
-            hand, pushes = push.end, pushes + 1
+            hand, pushes, known = push.end, pushes + 1, looked.known
             if once:
-                return self._end("once", pushes)
+                return Result("once", pushes)
 
-    def look(self, hand: motion.Held, *, pushes: int = 0) -> Looked:
+    def look(self, hand: motion.Held, *, pushes: int = 0, known: Known | None = None) -> Looked:
         """Take an image and decide.
 
         Args:
             hand: where the last push was commanded to end.
             pushes: made in this trial.
+            known: the objects of the look before, among which the target was; None begins a trial.
+
+        Raises:
+            DeviceError: a device cannot go on.
+            ValueError: what is seen cannot be used; the log keeps the image.
         """
         frame = self._capture()
+        try:
+            return self._decide(frame, hand, pushes, known)
+        except ValueError:
+            if self.log is not None:
+                self.log.keep(pushes, frame)
+            raise
+
+    def _decide(self, frame: Frame, hand: motion.Held, pushes: int, known: Known | None) -> Looked:
         clock = _Clock()
         masks = self.segmenter.segment(frame)
-        target = self.target.find(masks)
         clock.lap("segmentation")
-        entry = self.decider.contract.grid
-        labels = fuse(masks, target, entry.labels, self.view.camera.shape)
-        metres = depth_in_metres(frame.depth, scale=self.depth_scale, shape=self.view.camera.shape)
-        depth, cut = (self.view.cut(image).copy() for image in (metres, labels))
+        entry, shape = self.decider.contract.grid, self.view.camera.shape
+        depth = self.view.cut(depth_in_metres(frame.depth, scale=self.depth_scale, shape=shape)).copy()
+        refuse_size(masks, shape)
+        things = things_of(masks, depth, self.view)
+        target = find_target(self.target, masks, things, known)
+        labels = fuse(masks, target, entry.labels)
+        cut = self.view.cut(labels).copy()
         clock.lap("reading")
         joints = frame.joint_pos
         draw_robot(depth, cut, view=self.view, body=self.decider.body, joint_pos=joints, entry=entry)
@@ -149,7 +176,7 @@ class Station:
         clock.lap("projection")
         decision = self.decider.decide(maps, hand, joints, search=choose, lap=clock.lap)
         clock.lap("decoding")
-        return Looked(frame, labels, maps, decision, clock.times_ms)
+        return Looked(frame, labels, maps, decision, clock.times_ms, Known(masks.names, things, target))
 
     def _capture(self) -> Frame:
         depth, color, taken = self.source.capture()
@@ -179,11 +206,9 @@ class Station:
                 times_ms=looked.times_ms,
             )
 
-    def _end(self, reason: str, pushes: int) -> Result:
+    def _conclude(self, result: Mapping[str, Any]) -> None:
         if self.log is not None:
-            self.log.conclude({"reason": reason, "pushes": pushes})
-        self.say(f"{reason.replace('_', ' ')} after {pushes} pushes")
-        return Result(reason, pushes)
+            self.log.conclude(result)
 
 
 class _Clock:

@@ -73,14 +73,22 @@ class Target:
         return int(hit[0])
 
 
-def fuse(masks: Masks, target: int, labels: Mapping[str, int], shape: tuple[int, int]) -> np.ndarray:
-    """Return the labels [rows, columns] uint8 of masks; where they overlap the surest one counts.
+def refuse_size(masks: Masks, shape: tuple[int, int]) -> None:
+    """Refuse masks of another image.
 
     Raises:
-        ValueError: masks of another size, an empty one of the target.
+        ValueError: they have not as many rows and columns as `shape` says.
     """
     if masks.masks.shape[1:] != shape:
         raise ValueError(f"masks have shape {list(masks.masks.shape)}; allowed is N x {shape[0]} x {shape[1]}")
+
+
+def fuse(masks: Masks, target: int, labels: Mapping[str, int]) -> np.ndarray:
+    """Return the labels [rows, columns] uint8 of masks; where they overlap the surest one counts.
+
+    Raises:
+        ValueError: hardly anything is seen of the target.
+    """
     values = [labels["target" if index == target else "obstacle"] for index in range(len(masks.masks))]
     image = _paint(masks, values, table=labels["table"])
     if (image == labels["target"]).sum() < _MIN_PIXELS:

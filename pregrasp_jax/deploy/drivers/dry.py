@@ -7,7 +7,7 @@ import numpy as np
 from pregrasp_jax.deploy.decision import Push
 from pregrasp_jax.deploy.guard import Limits, refuse_motion, refuse_pose
 from pregrasp_jax.deploy.poses import tcp_pose
-from pregrasp_jax.robot.kinematics import Arm
+from pregrasp_jax.robot.kinematics import Arm, grasp_pose
 
 
 class DryArm:
@@ -32,18 +32,22 @@ class DryArm:
 
     def push(self, push: Push) -> None:
         """Say the command, after the checks that a real one passes."""
-        start, end = push.poses[0], push.poses[-1]
-        refuse_motion(start[:3], end[:3], speed=self._speed, acceleration=self._acceleration, limits=self._limits)
-        pose = refuse_pose(tcp_pose(self._arm, end))
+        self._check(push.poses[0, :3], push.poses[-1, :3])
+        pose = refuse_pose(tcp_pose(self._arm, push.poses[-1]))
         self._say(f"dry: moveL({np.round(pose, 4).tolist()}, speed {self._speed:g} m/s), {push.seconds:.2f} s")
         self._joints = np.array(push.joints[-1], float)
 
     def lift(self, height_m: float) -> None:
-        """Say it."""
+        """Say it, after the same checks."""
+        start = grasp_pose(self._arm, self._joints)[:3]
+        self._check(start, start + np.array([0.0, 0.0, height_m]))
         self._say(f"dry: lift by {height_m:g} m")
 
     def close(self) -> None:
         """Nothing is open."""
+
+    def _check(self, start: np.ndarray, end: np.ndarray) -> None:
+        refuse_motion(start, end, speed=self._speed, acceleration=self._acceleration, limits=self._limits)
 
 
 class DryGripper:

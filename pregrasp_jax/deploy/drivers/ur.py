@@ -110,7 +110,7 @@ class UrArm:
             raise DeviceError(f"no UR controller at {host} ({one_line(error)})") from None
         offset = np.asarray(self._control.getTCPOffset(), float)
         wanted = np.concatenate([self._arm.flange_from_hand[:3, 3], np.zeros(3)])
-        if offset.shape != (6,) or np.abs(offset - wanted).max() > TCP_ERROR:
+        if offset.shape != (6,) or not np.abs(offset - wanted).max() <= TCP_ERROR:
             raise DeviceError(
                 f"the controller's tool centre point is {np.round(offset, 4).tolist()}; the policy needs "
                 f"{np.round(wanted, 4).tolist()} (m, rotation vector): set it in the installation"
