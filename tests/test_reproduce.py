@@ -150,6 +150,9 @@ def test_the_same_command_goes_on_and_another_budget_is_refused(reproduced):
         files = [evaluation_files(more, k.trial, folder.run(k.trial))["mine"] for k in folder.states()]
         assert [json.loads(file.read_text())["episodes"] for file in files] == [episodes] * len(files)
     assert all(len((folder.run(k.trial) / "sessions").read_text().splitlines()) == 1 for k in folder.states())
+    with folder.drive(), pytest.raises(ValueError, match="is driven by"):
+        _open(folder.path, dataclasses.replace(spec, tests={}))
+    assert folder.spec().tests, "another's sweep is as it was"
     other = with_stub(experiments.make_spec(experiments.read_experiment("table2")), **{"train.env_steps": 400})
     with pytest.raises(ValueError, match=r"began with another set .*; allowed is the same, or another --dir"):
         _open(folder.path, other)

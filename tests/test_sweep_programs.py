@@ -36,7 +36,7 @@ def test_a_program_that_is_not_there_is_refused_once(tmp_path):
     assert known.message == "error: nosuchprogram cannot be run (No such file or directory); allowed is a program"
 
 
-@pytest.mark.parametrize("code", [1, 2])
+@pytest.mark.parametrize("code", [0, 1, 2])
 def test_workers_that_write_nothing_down_are_given_up(code, tmp_path):
     """As when somebody has spoilt spec.yaml meanwhile."""
     folder, spec = begin(tmp_path)

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from test_sweep import make_spec, sessions
 
-from pregrasp_jax.cli.sweep import drive
+from pregrasp_jax.cli.sweep import drive, worker
 from pregrasp_jax.sweep import driver, slurm
 from pregrasp_jax.sweep.folder import SweepFolder
 from pregrasp_jax.sweep.spec import Spec
 from pregrasp_jax.sweep.trials import evaluation_files
-from pregrasp_jax.sweep.worker import BUSY, UNWRITTEN
+from pregrasp_jax.sweep.worker import BUSY, UNWRITTEN, Worker
 
 FAKE = Path(__file__).parent / "fake_sbatch.py"
 
@@ -32,7 +32,7 @@ def test_the_script_says_what_a_task_needs_and_is_replaced_by_the_worker(tmp_pat
     lines = slurm.sbatch_text(folder, spec, "rung-100", 12, ["--rung", "100"], parallel=3).splitlines()
     options = {line for line in lines if line.startswith("#SBATCH")}
     wanted = ["array=0-11%3", "cpus-per-task=4", "mem=8000M", "gres=gpu:1", "signal=B:TERM@180", "open-mode=append"]
-    last = r'exec \S+ -m pregrasp_jax sweep worker \S+ --rung 100 --task "\$SLURM_ARRAY_TASK_ID"'
+    last = r'exec \S+ -m pregrasp_jax sweep worker \S+ --requeue True --rung 100 --task "\$SLURM_ARRAY_TASK_ID"'
     assert {f"#SBATCH --{option}" for option in [*wanted, "partition=gpu", "time=4:00:00"]} < options
     assert lines[0] == "#!/bin/bash" and "#SBATCH --requeue" in options
     assert re.fullmatch(last, lines[-1])
@@ -61,6 +61,28 @@ def test_a_task_goes_back_into_the_queue_unless_there_is_nothing_left_to_do(
     folder.ask_to_stop(True)
     slurm.requeue(folder, trial, code)
     assert len(calls) == again, "not while the sweep is asked to stop"
+
+
+def test_only_a_task_of_slurm_is_put_back(tmp_path, monkeypatch):
+    """A local sweep in somebody's own job must not end that."""
+    folder, _ = begin(tmp_path)
+    calls = []
+    monkeypatch.setattr(Worker, "run", lambda self: 143)
+    monkeypatch.setattr(slurm, "requeue", lambda *about: calls.append(about[2]))
+    assert worker(folder.path, task=0) == 143 and calls == []
+    assert worker(folder.path, task=0, requeue=True) == 143 and calls == [143]
+
+
+def test_a_trial_that_is_done_may_still_lack_a_test(tmp_path):
+    folder, spec = begin(tmp_path, stop={"method": "halving", "rungs": [100], "keep": 0.5})
+    first, second = (known.trial for known in folder.states())
+    for trial, outcome, score in ((first, "done", 0.1), (second, "rung", 0.9)):
+        folder.append({
+            "event": "ended", "id": trial.id, "rung": 100, "outcome": outcome, "exit_code": 0, "seconds": 1.0,
+            "scores": {"100": score},
+        })  # fmt: skip
+    found = [slurm.trial_of(folder, spec, task, rung=None, final=False) for task in (0, 1)]
+    assert [trial and trial.id for trial in found] == [first.id, second.id]
 
 
 def test_what_slurm_cannot_do_is_refused(tmp_path, monkeypatch):

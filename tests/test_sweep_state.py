@@ -50,6 +50,14 @@ def test_the_share_that_is_kept_is_of_the_number_of_settings():
     assert len(state.survivors(spec, states, 2000)) == 7
 
 
+def test_a_policy_that_is_not_trained_takes_no_setting_its_place():
+    spec, states = halving({0.1: [0.5, 0.5], 0.12: [0.9, 0.2]}, reached=1)
+    (script,) = setting_trials(spec, {}, name="clear", policy="clear")
+    states.append(TrialState(script, outcome="done", begun=True))
+    assert radii(next_jobs(spec, states)) == [(0.12, seed, 4000) for seed in (0, 1)]
+    assert state.dropped(spec, states) == {s.trial.id for s in states[:2]}
+
+
 def test_who_passed_the_last_rung_goes_to_the_end_and_is_ranked_before_who_did_not():
     spec, states = halving({0.1: [0.5, 0.5], 0.12: [0.6, 0.6], 0.14: [0.1, 0.1], 0.16: [0.2, 0.2]}, reached=2)
     for s in states[4:]:
@@ -91,6 +99,11 @@ def test_a_score_is_the_best_up_to_the_rung():
     assert measured(rows, metric, 200) == {"score": 0.5, "motions": 2.0, "env_steps": 300}
     assert measured(rows, metric, 400)["score"] is None
     assert measured(rows, metric, None) == {"score": 0.9, "motions": None, "env_steps": 300}
+    lost = {"env_steps": 400, metric: float("nan"), "eval/mean_motions": 1.0}
+    assert measured([*rows, lost], metric, None) == {"score": 0.9, "motions": None, "env_steps": 400}
+    assert measured([lost, {**lost, metric: float("inf")}], metric, None)["score"] is None
+    no_motions = {"env_steps": 9, metric: 0.1, "eval/mean_motions": float("nan")}
+    assert measured([no_motions], metric, None) == {"score": 0.1, "motions": None, "env_steps": 9}
     assert measured([], metric, None) == {"score": None, "motions": None, "env_steps": 0}
 
 

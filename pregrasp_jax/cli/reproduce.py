@@ -82,7 +82,7 @@ def _open(path: Path, spec: Spec) -> SweepFolder:
     """Return the folder of an experiment, new or as it was left.
 
     Raises:
-        ValueError: it was begun with another budget, other seeds or another version of the experiment.
+        ValueError: it was begun with another budget, other seeds or another version of the experiment, or is driven.
     """
     if not (path / SPEC).exists():
         return SweepFolder.create(path, spec)
@@ -94,8 +94,9 @@ def _open(path: Path, spec: Spec) -> SweepFolder:
                 f"{path} began with another {key} ({then.get(key)}, now {now.get(key)}); allowed is the same, or "
                 "another --dir"
             )
-    folder.ask_to_stop(False)
-    folder.edit(tests=spec.tests, resources=spec.resources)
+    with folder.drive():
+        folder.ask_to_stop(False)
+        folder.edit(tests=spec.tests, resources=spec.resources)
     return folder
 
 

@@ -147,7 +147,14 @@ def report(folder: Path, /, *, html: Path | None = None) -> None:
 
 
 def worker(
-    folder: Path, /, *, task: int, rung: int | None = None, final: bool = False, cores: tuple[int, ...] = ()
+    folder: Path,
+    /,
+    *,
+    task: int,
+    rung: int | None = None,
+    final: bool = False,
+    cores: tuple[int, ...] = (),
+    requeue: bool = False,
 ) -> int:
     """Bring one trial to a rung or to its end; this is what launchers call.
 
@@ -157,6 +164,7 @@ def worker(
         rung: env steps at which to stop; the end if left out.
         final: plan the fresh seeds of the winners if that was not done.
         cores: those that the trial may use; all if left out.
+        requeue: put the SLURM task that this is back into the queue if its trial is to go on.
     """
     opened = SweepFolder.open(folder)
     spec = opened.spec()
@@ -164,7 +172,8 @@ def worker(
     if trial is None:
         return 0
     code = Worker(opened, spec, trial, rung=rung, cores=cores).run()
-    slurm.requeue(opened, trial, code)
+    if requeue:
+        slurm.requeue(opened, trial, code)
     return code
 
 

@@ -108,7 +108,7 @@ class Driver:
     def _note_lost(self, trial_id: str, code: int, states: Sequence[TrialState]) -> None:
         """Give up where workers end again and again without writing anything down."""
         before, now = self._submitted.pop(trial_id), next(s.endings for s in states if s.trial.id == trial_id)
-        spoke = now > before or code in (0, BUSY) or (code == 143 and self._signal)
+        spoke = now > before or code == BUSY or (code == 143 and self._signal)
         self._lost[trial_id] = 0 if spoke else self._lost[trial_id] + 1
         if code == UNWRITTEN and self._lost[trial_id] > 1:
             raise ValueError(

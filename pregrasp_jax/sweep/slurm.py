@@ -85,7 +85,8 @@ def sbatch_text(
         **spec.slurm,
     }
     lines = [f"#SBATCH --{key}={value}" for key, value in settings.items()]
-    command = shlex.join([sys.executable, "-m", "pregrasp_jax", "sweep", "worker", str(folder.path), *options])
+    words = ["-m", "pregrasp_jax", "sweep", "worker", str(folder.path), "--requeue", "True", *options]
+    command = shlex.join([sys.executable, *words])
     # The batch shell alone gets the signal, so the worker takes its place.
     return "\n".join(["#!/bin/bash", *lines, "#SBATCH --requeue", f'exec {command} --task "$SLURM_ARRAY_TASK_ID"', ""])
 
@@ -104,7 +105,7 @@ def _sbatch(script: Path, after: str) -> str:
 
 
 def trial_of(folder: SweepFolder, spec: Spec, task: int, *, rung: int | None, final: bool) -> Trial | None:
-    """Return the trial of a task; None if halving has given it up, or there is no such winner.
+    """Return the trial of a task, though it may be over; None if halving has given it up, or there is no such winner.
 
     Raises:
         ValueError: there is no task of this number.
@@ -114,7 +115,7 @@ def trial_of(folder: SweepFolder, spec: Spec, task: int, *, rung: int | None, fi
         driver.plan_finals(folder, spec)
         chosen = [s.trial for s in folder.states() if s.trial.final]
         return chosen[task] if task < len(chosen) else None
-    found = next((s.trial for s in states if s.trial.number == task), None)
+    found = next((s for s in states if s.trial.number == task), None)
     if found is None:
         raise ValueError(f"there is no trial {task}; allowed is 0 to {len(states) - 1}")
     alive = [s for s in states if not s.trial.final]
@@ -122,11 +123,11 @@ def trial_of(folder: SweepFolder, spec: Spec, task: int, *, rung: int | None, fi
         if rung is not None and level >= rung:
             break
         alive = state.survivors(spec, alive, level)
-    return found if found.final or any(s.trial.id == found.id for s in alive) else None
+    return found.trial if found.trial.final or found.over or found in alive else None
 
 
 def requeue(folder: SweepFolder, trial: Trial, code: int) -> None:
-    """Put this task back into the queue if its time was up, its trial is worked on elsewhere, or failed for now.
+    """Put the SLURM task that this is back into the queue if its time was up, or its trial is busy or failed for now.
 
     Args:
         folder: of the sweep.

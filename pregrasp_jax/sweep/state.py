@@ -131,10 +131,13 @@ def rungs(spec: Spec) -> tuple[int, ...]:
 
 
 def survivors(spec: Spec, states: Sequence[TrialState], rung: int) -> list[TrialState]:
-    """Return the trials of the best settings at a rung, by the mean over their seeds; one with a failure is none."""
+    """Return the trials of the best settings at a rung, by the mean over their seeds; one with a failure is none.
+
+    A policy that is not trained comes to no rung, and takes no other's place.
+    """
     scores = {
         group: mean([state.scores.get(rung, -math.inf) for state in members])
-        for group, members in by_setting(states).items()
+        for group, members in by_setting([state for state in states if state.trial.policy is None]).items()
     }
     whole = sorted((group for group in scores if scores[group] > -math.inf), key=lambda group: -scores[group])
     kept = set(whole[: math.ceil(spec.stop.keep * len(scores) - 1e-9)])

@@ -6,6 +6,7 @@ be killed at any moment: the training then stops by itself, and the next worker 
 
 import ctypes
 import json
+import math
 import os
 import signal
 import subprocess
@@ -225,14 +226,20 @@ def measured(rows: Sequence[Mapping[str, Any]], metric: str, rung: int | None) -
     Returns:
         score, None if the rung was not reached; its mean motions, and the env steps so far.
     """
-    tested = [row for row in rows if isinstance(row.get(metric), int | float)]
+    tested = [row for row in rows if _finite(row.get(metric))]
     at = next((i for i, row in enumerate(tested) if rung is not None and row["env_steps"] >= rung), None)
     steps = max((row["env_steps"] for row in rows), default=0)
     if rung is not None and at is None:
         return {"score": None, "motions": None, "env_steps": steps}
     known = tested if at is None else tested[: at + 1]
     best = max(known, key=lambda row: (row[metric], row["env_steps"]), default={})
-    return {"score": best.get(metric), "motions": best.get("eval/mean_motions"), "env_steps": steps}
+    motions = best.get("eval/mean_motions")
+    return {"score": best.get(metric), "motions": motions if _finite(motions) else None, "env_steps": steps}
+
+
+def _finite(value: Any) -> bool:
+    """Return whether a value of a row is a number; a program's own rows may hold NaN, which says nothing."""
+    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def _last_words(log: Path) -> str:
