@@ -25,6 +25,9 @@ Normalization = Literal["none", "batch"]
 STYLES = ("ppg", "target-ppg")
 """Ways of playing a policy of strokes, and names of the one that ships."""
 
+VALUES_DEPEND_ON = ("learner.discount", "train.try_grasps", "task.in_region_reward", "task.approach_reward")
+"""Settings that decide what a value means."""
+
 PUSHING = ("pretrained", "cpu-1")
 """Names of the policies of pushes that ship: the best, and what the preset `cpu` makes with seed 1 in 100 minutes."""
 
@@ -341,10 +344,14 @@ class Config:
 
 def with_absolute_paths(config: Config) -> Config:
     """Return a config whose folders and files mean the same from any working directory."""
-    folder, sensor = config.assets.object_dir, config.task.sensor
+    folder, sensor, collection = config.assets.object_dir, config.task.sensor, config.strokes.collection
     if folder is not None:
         assets = dataclasses.replace(config.assets, object_dir=os.path.abspath(folder))
         config = dataclasses.replace(config, assets=assets)
     if sensor.endswith((".yaml", ".yml")):
         config = dataclasses.replace(config, task=dataclasses.replace(config.task, sensor=os.path.abspath(sensor)))
+    if collection is not None:
+        config = dataclasses.replace(
+            config, strokes=dataclasses.replace(config.strokes, collection=os.path.abspath(collection))
+        )
     return config

@@ -5,6 +5,7 @@ import errno
 import hashlib
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +15,9 @@ import numpy as np
 
 PARTIAL = ".partial"
 """Ending of files that are being written."""
+
+_OLD = "old"
+"""Name of a folder that is put aside while another takes its place."""
 
 _LONGEST_NAME = 255
 """Bytes, of one file or folder."""
@@ -129,7 +133,7 @@ def staged_folder(folder: Path) -> Iterator[Path]:
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=_hidden(folder), suffix=PARTIAL, dir=folder.parent) as beside:
-        new, old = Path(beside, "new"), Path(beside, "old")
+        new, old = Path(beside, "new"), Path(beside, _OLD)
         new.mkdir()
         yield new
         try:
@@ -148,9 +152,15 @@ def _hidden(path: Path) -> str:
 
 
 def sweep(folder: Path) -> None:
-    """Delete what writers that were killed have left anywhere under `folder`; nobody else may be writing there."""
-    for path in folder.rglob(f".*{PARTIAL}"):
-        path.unlink(missing_ok=True)
+    """Delete what writers that were killed have left anywhere under `folder`; nobody else may be writing there.
+
+    A folder that `staged_folder` had put aside stays where it is: it may be all that there is of it.
+    """
+    for path in list(folder.rglob(f".*{PARTIAL}")):
+        if not path.is_dir():
+            path.unlink(missing_ok=True)
+        elif not (path / _OLD).exists():
+            shutil.rmtree(path)
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from pregrasp_jax.checkpoint import read_config, write_config
-from pregrasp_jax.config import Config
+from pregrasp_jax.config import Config, with_absolute_paths
 from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.ranges import RANGES
 from pregrasp_jax.settings import difference, to_dict
@@ -88,6 +88,15 @@ def test_an_int_passes_for_a_float_but_not_the_reverse():
     assert Config.from_dict({"network": {"width": 1}}).network.width == 1.0
     with pytest.raises(ValueError, match="wrong type"):
         Config.from_dict({"seed": 1.0})
+
+
+def test_a_run_finds_its_files_from_any_working_directory(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    values = {"assets": {"object_dir": "meshes"}, "task": {"sensor": "mine.yaml"}, "strokes": {"collection": "run"}}
+    config = with_absolute_paths(Config.from_dict(values))
+    found = config.assets.object_dir, config.task.sensor, config.strokes.collection
+    assert found == tuple(str(tmp_path / name) for name in ("meshes", "mine.yaml", "run"))
+    assert with_absolute_paths(config) == config and with_absolute_paths(Config()) == Config()
 
 
 def test_difference_names_every_change():

@@ -33,7 +33,7 @@ import sys
 
 class Forbidden:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("jax", "jaxlib", "flax", "mujoco", "optax", "torch"):
+        if name.split(".")[0] in ("jax", "jaxlib", "flax", "mujoco", "optax", "torch", "trimesh", "coacd"):
             raise AssertionError(f"{name} was imported")
 
 sys.meta_path.insert(0, Forbidden())

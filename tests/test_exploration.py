@@ -11,6 +11,7 @@ from fake_env import ACTIONS, hand_at
 
 from pregrasp_jax.config import ExplorationConfig
 from pregrasp_jax.policies import exploration
+from pregrasp_jax.policies.scripts import nearest_action
 from pregrasp_jax.spaces.actions import ActionSpace, Choice
 from pregrasp_jax.training.collect import epsilon_at
 
@@ -191,6 +192,20 @@ def test_a_cell_is_drawn_among_those_that_the_choice_allows():
         row, col, choice = (np.asarray(x) for x in actions.unravel(flat))
         assert set(choice) == {0, 1, 2}
         np.testing.assert_array_equal(np.stack([row, col], axis=-1), cells[choice])
+
+
+def test_a_choice_with_which_nothing_is_allowed_is_not_drawn():
+    actions = choices(0.0, 0.5, 1.0)
+    mask = jnp.zeros(actions.shape, bool).at[50, 60, 1].set(True)
+    keys = jax.random.split(jax.random.key(1), 50)
+    guided = functools.partial(exploration.guided_action, actions=actions, angle_std=0.5, open_probability=0.4)
+    drawn = [
+        jax.vmap(lambda key: exploration.random_action(key, mask, actions))(keys),
+        jax.vmap(lambda key: guided(key, hand_at(P1), jnp.zeros(2), mask))(keys),
+        jax.vmap(lambda choice: nearest_action(mask, jnp.zeros(2), choice, actions))(jnp.arange(3)),
+    ]
+    for flat in drawn:
+        assert set(np.asarray(flat)) == {(50 * 100 + 60) * 3 + 1}
 
 
 def best_apart(q: np.ndarray, mask: np.ndarray, *, count: int, spacing: float) -> list[tuple[int, int, int]]:

@@ -1,6 +1,7 @@
 """A run of PPG that learns from another run's grasps, is stopped, and goes on as if it had not been."""
 
 import dataclasses
+import errno
 import shutil
 import types
 from typing import Any
@@ -113,6 +114,61 @@ def test_the_split_is_disjoint_and_keeps_to_the_singulation_condition():
         split(grasps(3), 3, make_config(singulation=True))
 
 
+def test_what_a_run_has_no_use_for_is_refused_when_it_goes_on_too(collection):
+    changed = dataclasses.replace(PRESETS["ppg"], train=dataclasses.replace(PRESETS["ppg"].train, minutes=30.0))
+    with pytest.raises(ValueError, match=r"train\.minutes = 30\.0 is not known to"):
+        session.resume(changed, collection, console=SILENT)
+
+
+def test_it_is_one_process(tmp_path, monkeypatch):
+    monkeypatch.setattr(session, "_load", lambda *_: pytest.fail("nothing is built for it"))
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    with pytest.raises(ValueError, match="--distributed True is not known to"):
+        session.train(make_config(), tmp_path / "new", console=SILENT)
+
+
+def test_rows_that_were_lost_are_not_learnt_from():
+    positives = grasps(8)
+    for field in (positives.height, positives.index, positives.aperture, positives.gain):
+        field[2:5] = 0  # as a damaged checkpoint leaves them
+    learnt, held_out = split(positives, 8, make_config())
+    assert sorted([*learnt, *held_out]) == [0, 1, 5, 6, 7]
+    learnt, held_out = split(positives, 8, make_config(singulation=True))
+    assert sorted([*learnt, *held_out]) == [5, 6, 7]
+
+
+def test_a_full_disk_costs_a_file_and_not_the_run(collection, tmp_path, monkeypatch):
+    """Metrics, the best policy and a checkpoint under way; the first and the last checkpoint have to be written."""
+    config, said = make_config(collection=str(collection), epochs=1), []
+    env: Any = types.SimpleNamespace(primitive=types.SimpleNamespace(actions=ACTIONS))
+    full = {"is": False}
+    real = imitation.save
+
+    def crammed(*args: Any, **options: Any) -> Any:
+        if full["is"]:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(*args, **options)
+
+    def learn(session: Any) -> bool:
+        full["is"] = True
+        session._validate(np.arange(2))
+        session.try_to_save()
+        full["is"] = False
+        return True
+
+    monkeypatch.setattr(imitation, "save", crammed)
+    monkeypatch.setattr(imitation, "save_policy", crammed)
+    monkeypatch.setattr(imitation._Session, "learn", learn)
+    console: Any = types.SimpleNamespace(say=said.append, start=lambda: None)
+    with RunFolder.create(tmp_path / "run", config) as folder:
+        monkeypatch.setattr(folder, "append_metrics", crammed)
+        ending = imitation.run(config, env, folder, console, resumed=False, stop=lambda: False)
+    warnings = [line for line in said if line.startswith("warning: no ")]
+    assert ending.startswith("done:")
+    assert [line.split()[2] for line in warnings] == ["policy", "metrics", "checkpoint"]
+    assert all("(No space left on device: " in line and line.endswith("the run goes on") for line in warnings)
+
+
 @pytest.mark.parametrize("size", [1, 4, 8, 10, 16])
 def test_every_grasp_counts_once_in_a_validation_loss(size):
     rows, losses = np.arange(3, 13), np.random.default_rng(0).normal(size=(2, 13))
@@ -154,7 +210,7 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(collection, tmp_path):
                 stop=lambda: next(left, True),  # pyright: ignore
             )
 
-    assert "done: 6 stable grasps" in part(tmp_path / "whole", 100, resumed=False)
+    assert "done: 4 stable grasps" in part(tmp_path / "whole", 100, resumed=False)
     assert "interrupted at step 3" in part(tmp_path / "parts", 3, resumed=False)
     assert "done" in part(tmp_path / "parts", 100, resumed=True)
     whole, parts = (load_policy(tmp_path / name) for name in ("whole", "parts"))

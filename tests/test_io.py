@@ -50,6 +50,17 @@ def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
     assert os.listdir(folder) == ["new"] and os.listdir(tmp_path) == ["bundle"]
 
 
+def test_what_killed_writers_leave_is_deleted_but_for_a_folder_that_was_put_aside(tmp_path):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / ".file.abc.partial").write_bytes(b"half")
+    for name, inside in ((".bundle.a.partial", "new"), (".bundle.b.partial", "old")):
+        (tmp_path / name / inside).mkdir(parents=True)
+        (tmp_path / name / inside / ".x.y.partial").write_bytes(b"half")
+    io.sweep(tmp_path)
+    left = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*"))
+    assert left == [".bundle.b.partial", ".bundle.b.partial/old", "runs"]
+
+
 def test_a_name_that_is_too_long_is_refused_before_the_work_and_one_that_fits_can_be_written(tmp_path):
     io.write_bytes(tmp_path / ("n" * 255), b"whole")
     io.refuse_unwritable(tmp_path / ("n" * 255))

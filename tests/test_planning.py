@@ -147,7 +147,10 @@ def test_scripts_join_one_proposal_and_compiling_takes_none_of_the_first_decisio
 
     values = np.full((9, 9, 2), -np.inf)
     values[4, 4, 1] = 0.5
-    scripted = SimpleNamespace(values=lambda *_: values, script=lambda *_: [5, 6])
+    compiled: list[str] = []
+    scripted = SimpleNamespace(
+        values=lambda *_: values, script=lambda *_: [5, 6], compile_grasp=lambda *_: compiled.append("grasp")
+    )
     stub: Any = object.__new__(Planner)
     vars(stub).update(
         {
@@ -163,7 +166,7 @@ def test_scripts_join_one_proposal_and_compiling_takes_none_of_the_first_decisio
     sight: Any = SimpleNamespace(obs=None, target=0, pushes=0)
     assert [stub.decide(sight, ("",), jax.random.key(0)).action for _ in range(2)] == [6, 6]
     best = (4 * 9 + 4) * 2 + 1
-    assert [candidates for candidates, _ in searched] == [[best, 5, 6]] * 3
+    assert [candidates for candidates, _ in searched] == [[best, 5, 6]] * 3 and compiled == ["grasp"]
     assert [math.isinf(deadline) for _, deadline in searched] == [True, False, False]
 
 

@@ -7,15 +7,13 @@ from typing import Any
 
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint.policy import TrainedPolicy, load_policy, save_policy
+from pregrasp_jax.config import VALUES_DEPEND_ON
 from pregrasp_jax.learning.members import join, split
 from pregrasp_jax.ranges import RANGES
 from pregrasp_jax.settings import flatten, to_dict
 
 _FREE = ("network.members", "network.initial_bias")
 """Settings of the network that may differ."""
-
-_REWARDS = ("learner.discount", "train.try_grasps", "task.in_region_reward", "task.approach_reward")
-"""Settings of the training on which depends what a value means."""
 
 
 def combine(policies: Sequence[Path | str], folder: Path, *, any_values: bool = False) -> TrainedPolicy:
@@ -42,8 +40,8 @@ def combine(policies: Sequence[Path | str], folder: Path, *, any_values: bool = 
     wanted = _meaning(policies[0], loaded[0])
     for path, policy in zip(policies, loaded, strict=True):
         for name, value in _meaning(path, policy).items():
-            if value != wanted[name] and not (any_values and name in _REWARDS):
-                learnable = ", or --any-values True and to train on what comes out" if name in _REWARDS else ""
+            if value != wanted[name] and not (any_values and name in VALUES_DEPEND_ON):
+                learnable = ", or --any-values True and to train on what comes out" if name in VALUES_DEPEND_ON else ""
                 raise ValueError(
                     f"{path} has {name} = {value}, but {policies[0]} {wanted[name]}: the mean of their values would "
                     f"mean nothing; allowed are policies of one network, task and discount{learnable}"
@@ -75,5 +73,5 @@ def _meaning(path: Path | str, policy: TrainedPolicy) -> dict[str, Any]:
     return {
         name: value
         for name, value in settings.items()
-        if name in _REWARDS or (name.startswith(("network.", "task.")) and name not in _FREE)
+        if name in VALUES_DEPEND_ON or (name.startswith(("network.", "task.")) and name not in _FREE)
     }

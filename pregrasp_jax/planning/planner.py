@@ -106,6 +106,8 @@ class Planner:
         think = functools.partial(
             search, self._rollout, bank, roots, candidates, self._config, self._promise, left=left
         )
+        if not self._seconds:
+            self._rollout.compile_grasp(bank, roots)
         if self._config.budget_ms and not self._seconds:
             think(deadline=math.inf)  # compiles, which is no part of a decision
             begin = time.perf_counter()

@@ -134,6 +134,11 @@ class Rollout:
         """Return which grasps hold, [B] bool; those not to be executed [B] do not."""
         return np.asarray(self._run("grasp", self._grasp, bank, states, execute).held)
 
+    def compile_grasp(self, bank: HullBank, roots: EnvState) -> None:
+        """Compile grasps ahead of the first that is tried, which may be far into a trial; nothing is simulated."""
+        states = jax.tree.map(lambda leaf: np.repeat(leaf[:1], self.batch, axis=0), roots)
+        self.grasp(bank, states, np.zeros(self.batch, bool))
+
     def _run(self, name: str, stages: Stages, *args: Any) -> Any:
         if name not in self._compiled:
             self._compiled[name] = stages.compile(*args)

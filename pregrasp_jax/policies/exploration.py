@@ -54,7 +54,7 @@ def guided_action(
     """
     assert hand.xy.shape == target_xy.shape == (2,) and mask.shape == actions.shape, mask.shape
     key_cell, key_choice = jax.random.split(key)
-    choice = draw_choice(key_choice, actions, open_probability=open_probability)
+    choice = allowed_choice(mask, draw_choice(key_choice, actions, open_probability=open_probability))
     centers = grid.cell_centers(jnp)
     dx, dy = centers[None, :] - hand.xy[0], centers[:, None] - hand.xy[1]
     direction = jnp.arctan2(target_xy[1] - hand.xy[1], target_xy[0] - hand.xy[0])
@@ -118,7 +118,7 @@ def random_action(key: jax.Array, mask: jax.Array, actions: ActionSpace) -> jax.
     """
     assert mask.shape == actions.shape, mask.shape
     key_cell, key_choice = jax.random.split(key)
-    choice = draw_choice(key_choice, actions)
+    choice = allowed_choice(mask, draw_choice(key_choice, actions))
     return _draw_cell(key_cell, jnp.where(mask[..., choice], 0.0, -jnp.inf), choice, actions)
 
 
@@ -138,6 +138,17 @@ def draw_choice(key: jax.Array, actions: ActionSpace, *, open_probability: float
         return jax.random.bernoulli(key, share).astype(jnp.int32)
     weights = np.where(widest, share / widest.sum(), (1 - share) / max((~widest).sum(), 1))
     return jax.random.categorical(key, jnp.log(jnp.asarray(weights, jnp.float32))).astype(jnp.int32)
+
+
+def allowed_choice(mask: jax.Array, choice: jax.Array) -> jax.Array:
+    """Return a choice () int32, or the first one with which something is allowed if nothing is with that.
+
+    Args:
+        mask: [H, W, K] bool, the actions that are allowed.
+        choice: () int32.
+    """
+    possible = jnp.any(mask, axis=(0, 1))
+    return jnp.where(possible[choice], choice, jnp.argmax(possible)).astype(jnp.int32)
 
 
 def _draw_cell(key: jax.Array, logits: jax.Array, choice: jax.Array, actions: ActionSpace) -> jax.Array:

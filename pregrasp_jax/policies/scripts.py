@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from pregrasp_jax.config import ExplorationConfig
-from pregrasp_jax.policies.exploration import guided_action, random_action
+from pregrasp_jax.policies.exploration import allowed_choice, guided_action, random_action
 from pregrasp_jax.spaces import grid
 from pregrasp_jax.spaces.actions import ActionSpace
 from pregrasp_jax.task.env import Env
@@ -203,7 +203,7 @@ SCRIPTS: dict[str, Callable[[Env], Policy]] = {
 
 
 def nearest_action(mask: jax.Array, point: jax.Array, choice: jax.Array, actions: ActionSpace) -> jax.Array:
-    """Return the action () int32 of a choice () that is allowed and ends nearest to `point` [2], m.
+    """Return the action () int32 that is allowed and ends nearest to `point` [2], m, of a choice () if that can be.
 
     Args:
         mask: [H, W, K] bool, the actions that are allowed.
@@ -211,6 +211,7 @@ def nearest_action(mask: jax.Array, point: jax.Array, choice: jax.Array, actions
         choice: () int32.
         actions: what they mean.
     """
+    choice = allowed_choice(mask, choice)
     centers = grid.cell_centers(jnp)
     distance_sq = (centers[None, :] - point[0]) ** 2 + (centers[:, None] - point[1]) ** 2
     row, col = jnp.divmod(jnp.argmin(jnp.where(mask[..., choice], distance_sq, jnp.inf)), grid.GRID_SIZE)

@@ -93,14 +93,14 @@ def run(config: Config, env: Env, folder: RunFolder, console: Console, *, resume
     session.start(resumed=resumed and folder.has_checkpoint)
     console.start()
     collected = session.collect()
-    session.save()  # before it is learnt from, which may find too few grasps
+    session.try_to_save()  # before it is learnt from, which may find too few grasps
     learned = collected and session.learn()
     if collected:
         session.save()
     if not learned:
         return f"interrupted at step {session.counters.step}; continue with `{command('train', 'resume', folder.path)}`"
     losses = ", ".join(f"{name} {loss:.3g}" for name, loss in session.counters.best.items())
-    return f"done: {session.counters.written} stable grasps learnt from; validation loss: {losses}"
+    return f"done: {session.learnt_from} stable grasps learnt from; validation loss: {losses}"
 
 
 def mean_losses(losses_of: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, size: int) -> np.ndarray:
@@ -117,13 +117,15 @@ class _Session:
 
     def __init__(self, config: Config, env: Env, folder: RunFolder, console: Console, stop: StopFn):
         self.config, self.env, self.folder, self.console, self.stop = config, env, folder, console, stop
-        self.key, self._scene_key, self._init_key = jax.random.split(jax.random.key(config.seed), 3)
+        keys = jax.random.split(jax.random.key(config.seed), 4)
+        self.key, self._scene_key, self._init_key, self._turn_key = keys
         self.function = StrokeFunction(config.strokes, env.primitive.actions)
         self.counters = Counters()
         self.positives: Positives = blank_positives(config.strokes.positives)
         self._losses_of = jax.jit(
             lambda params, batch: self.function.losses(params, self._shown(batch), train=False)[0]
         )
+        self.learnt_from = 0
         self._saved_at = time.monotonic()
 
     def start(self, *, resumed: bool) -> None:
@@ -145,12 +147,20 @@ class _Session:
             f"resuming {self.folder.path}: {self.counters.written} stable grasps, {self.counters.updates} updates"
         )
 
+    def try_to_save(self) -> None:
+        """Write a checkpoint if the disk has room for it."""
+        self._write("checkpoint", self.save)
+        self._saved_at = time.monotonic()
+
     def save(self) -> None:
-        """Write a checkpoint."""
+        """Write a checkpoint.
+
+        Raises:
+            OSError: the disk is full.
+        """
         ring = Ring(self.positives, self.counters.written)
         extra = dataclasses.asdict(self.counters)
         save(self.folder.checkpoints, self.counters.step, self.state, ring, extra, policy="best/")
-        self._saved_at = time.monotonic()
 
     def collect(self) -> bool:
         """Attempt strokes until enough of them were stable; return whether there was time to."""
@@ -179,6 +189,7 @@ class _Session:
         """Go through the stable grasps `epochs` times; return whether there was time to."""
         counters, strokes = self.counters, self.config.strokes
         training, validation = split(self.positives, counters.written, self.config)
+        self.learnt_from = len(training)
         per_epoch = -(-len(training) // strokes.batch_size)
         optimizer = self._optimizer(per_epoch)
         shown = self._shown
@@ -197,7 +208,7 @@ class _Session:
             rows = np.resize(order, per_epoch * strokes.batch_size).reshape(per_epoch, -1)[place]
             batch = jax.tree.map(lambda leaf, rows=rows: leaf[rows], self.positives)
             self.state["learner"], losses = step(
-                self.state["learner"], batch, jax.random.fold_in(self.key, counters.updates)
+                self.state["learner"], batch, jax.random.fold_in(self._turn_key, counters.updates)
             )
             counters.updates += 1
             losses = jax.device_get(losses)
@@ -223,9 +234,8 @@ class _Session:
                 best[name] = loss
                 self.state["best"] = {**self.state["best"], name: params[name]}
         evaluation = {"env_steps": self.counters.step, **{f"{name}_loss": loss for name, loss in best.items()}}
-        save_policy(self.folder.best, self.state["best"], self.config, evaluation)
-        row = {f"eval/{name}_loss": loss for name, loss in losses.items()}
-        self.folder.append_metrics({"env_steps": self.counters.step, **row})
+        self._write("policy", lambda: save_policy(self.folder.best, self.state["best"], self.config, evaluation))
+        self._append({f"eval/{name}_loss": loss for name, loss in losses.items()})
         self.console.say(f"update {self.counters.updates}: validation loss {_listed(losses)}")
 
     def _shown(self, batch: Positives) -> Demonstration:
@@ -245,7 +255,11 @@ class _Session:
 
     def _save_if_due(self) -> None:
         if time.monotonic() - self._saved_at >= 60 * self.config.train.checkpoint_minutes:
-            self.save()
+            self.try_to_save()
+
+    def _write(self, what: str, write: Callable[[], object]) -> None:
+        """Write a file; a full disk costs that, not the run."""
+        self.folder.attempt(what, write, step=self.counters.step, say=self.console.say)
 
     def _tell_collection(self) -> None:
         counters, wanted = self.counters, self.config.strokes.positives
@@ -263,7 +277,7 @@ class _Session:
                 "collect/collided": counters.collided,
                 "collect/strokes_per_second": rate,
             }
-            self.folder.append_metrics({"env_steps": counters.step, **row, **self._times})
+            self._append({**row, **self._times})
 
     def _tell_learning(self, losses: Losses, num_updates: int) -> None:
         counters = self.counters
@@ -276,7 +290,10 @@ class _Session:
         )
         if counters.updates % _LOG_BATCHES == 0:
             row = {f"train/{name}_loss": loss for name, loss in named.items()}
-            self.folder.append_metrics({"env_steps": counters.step, **row, **self._times})
+            self._append({**row, **self._times})
+
+    def _append(self, row: dict[str, float]) -> None:
+        self._write("metrics", lambda: self.folder.append_metrics({"env_steps": self.counters.step, **row}))
 
     @property
     def _times(self) -> dict[str, float]:
@@ -287,19 +304,22 @@ class _Session:
 def split(positives: Positives, written: int, config: Config) -> tuple[np.ndarray, np.ndarray]:
     """Return which grasps are learnt from and which are kept for validation, as int arrays.
 
+    Rows that a damaged checkpoint has lost are neither: no stable grasp has an aperture of zero.
+
     Raises:
         ValueError: too few of them meet the singulation condition.
     """
     strokes = config.strokes
-    rows = np.arange(written)
+    rows = np.flatnonzero(np.asarray(positives.aperture)[:written] > 0)
     if strokes.singulation:
-        rows = rows[np.asarray(positives.gain)[:written] > SINGULATED]
+        rows = rows[np.asarray(positives.gain)[rows] > SINGULATED]
     rows = np.random.default_rng(_SHUFFLE).permutation(rows)
     held_out = round(strokes.validation_share * len(rows))
     if len(rows) - held_out < 1:
         raise ValueError(
-            f"{len(rows)} of {written} stable grasps can be learnt from (strokes.singulation = {strokes.singulation}, "
-            f"strokes.validation_share = {strokes.validation_share}); allowed are 2 or more; raise strokes.positives"
+            f"{len(rows)} of {written} stable grasps can be learnt from (strokes.singulation = {strokes.singulation}), "
+            f"and {held_out} of these are for validation (strokes.validation_share = {strokes.validation_share}); "
+            "allowed is one more at least; raise strokes.positives"
         )
     return rows[held_out:], rows[:held_out]
 

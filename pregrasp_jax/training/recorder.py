@@ -206,15 +206,5 @@ class Recorder:
 
     def _write(self, what: str, write: Callable[[], object]) -> bool:
         """Write a file; a full disk is reported, and the training goes on. Return whether it was written."""
-        if not self.folder.writes:
-            return True
-        try:
-            write()
-        except OSError as error:
-            last = "there is none yet" if self._saved_at < 0 else f"the last checkpoint is of step {self._saved_at}"
-            self.console.say(
-                f"warning: no {what} written at step {self.counters.env_steps} ({error.strerror}: {self.folder.path}); "
-                f"{last}"
-            )
-            return False
-        return True
+        last = "there is none yet" if self._saved_at < 0 else f"the last checkpoint is of step {self._saved_at}"
+        return self.folder.attempt(what, write, step=self.counters.env_steps, say=self.console.say, consequence=last)

@@ -9,6 +9,7 @@ import fcntl
 import json
 import os
 import platform
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -37,10 +38,7 @@ class RunFolder:
 
     Attributes:
         path: of the folder.
-        writes: whether this process writes to it.
     """
-
-    writes = True
 
     def __init__(self, path: Path, lock: TextIO | None):
         """Hold the lock; use `create` or `open`."""
@@ -151,6 +149,34 @@ class RunFolder:
         """Write what is appended to metrics.jsonl to TensorBoard's files too (see `EventLog`)."""
         self._event_log = EventLog(self.path / "tensorboard", resumed_at=resumed_at)
 
+    def attempt(
+        self,
+        what: str,
+        write: Callable[[], object],
+        *,
+        step: int,
+        say: Callable[[str], None],
+        consequence: str = "the run goes on",
+    ) -> bool:
+        """Write something of the run; a full disk is reported, and costs that alone.
+
+        Args:
+            what: the name of it.
+            write: does it.
+            step: of the run.
+            say: told what could not be written.
+            consequence: of that, for the message.
+
+        Returns:
+            Whether it was written.
+        """
+        try:
+            write()
+        except OSError as error:
+            say(f"warning: no {what} written at step {step} ({error.strerror}: {self.path}); {consequence}")
+            return False
+        return True
+
     def append_metrics(self, row: dict[str, Any]) -> None:
         """Append one row to metrics.jsonl, whole or not at all.
 
@@ -181,8 +207,6 @@ class RunFolder:
 class WatchedFolder(RunFolder):
     """A run folder as the processes see it that do not write: they only read its checkpoints."""
 
-    writes = False
-
     def __init__(self, path: Path):
         """Lock nothing."""
         super().__init__(path, None)
@@ -192,6 +216,10 @@ class WatchedFolder(RunFolder):
 
     def begin_event_log(self, *, resumed_at: int | None = None) -> None:
         """Write no events."""
+
+    def attempt(self, what: str, write: Callable[[], object], **about: Any) -> bool:
+        """Write nothing, which is all that there is to do."""
+        return True
 
     def append_metrics(self, row: dict[str, Any]) -> None:
         """Append nothing."""

@@ -10,7 +10,7 @@ import jax
 
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint.policy import load_policy
-from pregrasp_jax.config import Config, with_absolute_paths
+from pregrasp_jax.config import VALUES_DEPEND_ON, Config, with_absolute_paths
 from pregrasp_jax.evaluation import Evaluator
 from pregrasp_jax.evaluation.clearing import own_protocol
 from pregrasp_jax.learning.q_function import Params, make_q_function
@@ -30,9 +30,6 @@ from pregrasp_jax.training.recorder import EvaluateFn, Recorder
 from pregrasp_jax.training.run_folder import RunFolder, WatchedFolder, refuse_used
 from pregrasp_jax.training.sharding import make_layout
 from pregrasp_jax.training.trainer import CompileFn, Trainer
-
-VALUES_DEPEND_ON = ("learner.discount", "task.in_region_reward", "task.approach_reward")
-"""Settings that decide what a value means."""
 
 VALIDATION_ENVS = 16
 """Validation scenes side by side; the result does not depend on it."""
@@ -93,6 +90,7 @@ def resume(config: Config, run_dir: Path, *, console: Console | None = None) -> 
         console: told about progress.
     """
     prepare()
+    _refuse_unused(config)
     config = with_absolute_paths(config)
     folder = RunFolder.open(run_dir, config) if processes.is_first() else WatchedFolder(run_dir)
     with folder:
@@ -217,6 +215,8 @@ def _refuse_unused(config: Config) -> None:
 def _imitate(config: Config, run_dir: Path, folder: RunFolder | None, params: Params | None, console: Console) -> int:
     if params is not None:
         raise ValueError("--init-from is not known to train.method = imitation; allowed is to leave it out")
+    if jax.process_count() > 1:
+        raise ValueError("--distributed True is not known to train.method = imitation; allowed is one process")
     if folder is None and config.strokes.collection:
         imitation.refuse_collection(config)
     resumed = folder is not None
