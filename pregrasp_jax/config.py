@@ -220,7 +220,8 @@ class ExplorationConfig:
     epsilon_fraction: float = 1 / 9
     """Share of the run over which epsilon falls."""
     guided: bool = True
-    """Random actions aim at the target inside the half ring; False draws from all 20 000 (Random-Exp ablation)."""
+    """Random actions aim at the target inside the half ring; False draws from all that the
+    network values (Random-Exp ablation)."""
     angle_std: float = 0.5
     """rad, spread of guided actions around the direction to the target."""
     open_probability: float = 0.7

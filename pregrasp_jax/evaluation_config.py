@@ -82,8 +82,9 @@ class EvaluationConfig:
     """One evaluation."""
 
     policy: str
-    """random, guided, straight, clear, lookahead, pretrained, cpu-1, or a run folder; of a run of the preset `ppg` also
-    target-ppg:FOLDER, and untrained strokes or target-strokes (docs/baselines.md)."""
+    """random, guided, straight, clear, lookahead, pretrained, cpu-1, or the folder of a run, a policy or a bundle. Of
+    strokes (docs/baselines.md): ppg, target-ppg, strokes, target-strokes, a run of the preset `ppg`, or that as
+    target-ppg:FOLDER."""
     assets: AssetsConfig = field(default_factory=AssetsConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)

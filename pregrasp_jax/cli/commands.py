@@ -72,7 +72,7 @@ def combine(policies: tuple[str, ...], /, *, out: Path, any_values: bool = False
 
     Args:
         policies: two or more of one network, task and discount: run folders (the best policy of a run), their
-            folders `checkpoints` (the latest), policy folders, or pretrained.
+            folders `checkpoints` (the latest), policy folders, pretrained, or cpu-1.
         out: folder of the new policy. It is evaluated, exported and trained on like any other.
         any_values: take policies that were trained for other rewards and discounts, too. What they make together is to
             be trained on first (`train --init-from`).

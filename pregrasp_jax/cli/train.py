@@ -42,7 +42,7 @@ def _start(preset: Config) -> Callable[..., Session]:
         Args:
             run_dir: New or empty folder of the run.
             config: Settings.
-            init_from: Run or policy folder, or `pretrained`, whose parameters are the initial ones (fine-tuning).
+            init_from: Run or policy folder, `pretrained` or `cpu-1`, whose parameters are the initial ones.
             distributed: Train with the processes of other hosts, started with the same options (docs/devices.md).
             films: Whether the report shows episodes.
         """
