@@ -73,6 +73,14 @@ def row(object_set: str, document: dict[str, Any]) -> tuple[str, ...]:
     )
 
 
+def named(given: str) -> str:
+    """Return a name for a set or a policy that no other one has; of a folder also a hash of its place."""
+    style, _, path = given.rpartition(":")
+    if not Path(path).is_dir():
+        return given.replace(":", "-")
+    return "-".join(filter(None, [style, Path(path).name, io.content_hash(str(Path(path).resolve()))[:6]]))
+
+
 def main() -> None:
     """Evaluate what is missing, and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -85,9 +93,7 @@ def main() -> None:
     rows: list[tuple[str, ...]] = [HEADER]
     for object_set in arguments.sets:
         for policy in arguments.policies:
-            of_set = object_set if object_set in BUILTIN else f"folder-{Path(object_set).name}"
-            name = f"{of_set}-{policy.replace('/', '_').replace(':', '-')}-{arguments.episodes}.json"
-            path = arguments.out / name
+            path = arguments.out / f"{named(object_set)}-{named(policy)}-{arguments.episodes}.json"
             if not path.exists():
                 io.write_json(path, evaluate(policy, object_set, arguments.episodes, arguments.threads))
             rows.append(row(object_set, load_evaluation(path)))

@@ -18,19 +18,20 @@ def num_threads_asked() -> int:
 def guard_small_machine() -> bool:
     """Give XLA's CPU client at least four threads; with fewer, MJX programs deadlock in jaxlib 0.10.
 
-    XLA sizes its thread pool from ``NPROC`` when jax is first imported, so the guard must run before
-    that. If jax is already imported it is too late to help and a warning says which line to add.
+    XLA sizes its thread pool from ``NPROC``, or else by the cores, when jax is first imported, so the guard must run
+    before that. If jax is already imported it is too late to help and a warning says which line to add.
 
     Returns:
         Whether it has set ``NPROC``.
     """
     num_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if max(num_cores, num_threads_asked()) >= _MIN_XLA_THREADS:
+    num_threads = num_threads_asked() or num_cores
+    if num_threads >= _MIN_XLA_THREADS:
         return False
     if "jax" in sys.modules:
         warnings.warn(
-            f"jax was imported before pregrasp_jax on a machine with {num_cores} cores, where MJX programs can "
-            f"deadlock; add `import os; os.environ['NPROC'] = '{_MIN_XLA_THREADS}'` before the first `import jax`",
+            f"jax was imported before pregrasp_jax with {num_threads} threads for XLA, where MJX can deadlock; "
+            f"add `import os; os.environ['NPROC'] = '{_MIN_XLA_THREADS}'` before the first `import jax`",
             RuntimeWarning,
             stacklevel=2,
         )

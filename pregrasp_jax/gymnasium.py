@@ -39,6 +39,10 @@ ENV_ID = "pregrasp_jax/PreGrasp-v0"
 _INTEGER = (int, np.integer)
 
 
+def _drawn_seed() -> int:
+    return int(np.random.SeedSequence().generate_state(1)[0] >> 1)
+
+
 def observation_space() -> spaces.Dict:
     """Return what one scene shows.
 
@@ -116,16 +120,17 @@ class PreGraspVectorEnv(VectorEnv):
         """Start an episode in every scene.
 
         Args:
-            seed: scene i gets `seed + i`, or the i-th of a list. None goes on with the next episodes of the last seed;
-                the first time it draws one.
+            seed: scene i gets `seed + i`, or the i-th of a list, in which one is drawn for None. None alone goes on
+                with the next episodes of the last seed; the first time it draws one.
             options: none exist.
         """
         if options:
             raise ValueError(f"options {', '.join(options)} of reset do not exist; allowed are none")
         if seed is None and self._state is None:
-            seed = int(np.random.SeedSequence().generate_state(1)[0] >> 1)
+            seed = _drawn_seed()
         if seed is not None:
             seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, _INTEGER) else list(seed)
+            seeds = [_drawn_seed() if number is None else number for number in seeds]
             numbers = [int(number) for number in seeds if isinstance(number, _INTEGER)]
             known = all(0 <= number < 2**32 for number in numbers)
             if not (known and len(numbers) == len(seeds) == self.num_envs):

@@ -1,5 +1,6 @@
 """A search before every push of `deploy`, where JAX and MuJoCo are installed: `planning` behind `deploy.search`."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -106,7 +107,9 @@ def make_search(
     trained = load_policy(bundle.folder)
     if trained.config.train.method != "q_learning":
         raise ValueError(f"plan = True: {bundle.folder} chooses strokes; allowed is a policy that pushes")
-    config = Config(task=trained.config.task, scene=SceneConfig(test_scenes=1))  # of which no object is looked at
+    # No object of it is looked at, and the sensor of the training may be a file that is not here.
+    task = dataclasses.replace(trained.config.task, sensor="clean")
+    config = Config(task=task, scene=SceneConfig(test_scenes=1))
     env = make_env(config.validate(), split="test")
     assert env.robot.body is not None, "a decider has an arm"
     planner, arm = make_planner(env, trained, planning, camera_m=camera_m), env.robot.body.arm

@@ -275,6 +275,7 @@ def test_doctor_measures_a_cache_that_is_being_written(tmp_path: Path, monkeypat
         (2, "4", True, "4, set by pregrasp_jax: enough threads for XLA"),
         (2, "4", False, "4, set by the environment: enough threads for XLA"),
         (8, None, False, "unset: enough threads for XLA"),
+        (8, "2", False, "2, set by the environment: MJX may deadlock; set NPROC=4 before Python starts"),
         (2, None, False, "unset: MJX may deadlock; set NPROC=4 before Python starts"),
         (2, "abc", False, "abc, set by the environment: MJX may deadlock; set NPROC=4 before Python starts"),
     ],
@@ -290,9 +291,9 @@ def test_doctor_says_who_set_nproc(
     assert dict(doctor.describe())["NPROC"] == finding
 
 
-@pytest.mark.parametrize("nproc", ["abc", "", "2", None])
-def test_a_small_machine_is_guarded_whatever_nproc_says(monkeypatch: pytest.MonkeyPatch, nproc: str | None) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+@pytest.mark.parametrize(("cores", "nproc"), [(2, "abc"), (2, ""), (2, "2"), (2, None), (64, "2")])
+def test_too_few_threads_are_guarded_against(monkeypatch: pytest.MonkeyPatch, cores: int, nproc: str | None) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
     monkeypatch.setenv("NPROC", nproc or "")
     if nproc is None:
         monkeypatch.delenv("NPROC")

@@ -16,7 +16,16 @@ from pregrasp_jax.deploy.decision import Decider
 from pregrasp_jax.deploy.devices import DeviceError
 from pregrasp_jax.deploy.drivers.dry import DryArm, DryGripper
 from pregrasp_jax.deploy.files import FileSegmenter, FileSource
-from pregrasp_jax.deploy.guard import ArmState, Limits, refuse_motion, refuse_pose, refuse_state
+from pregrasp_jax.deploy.guard import (
+    LIFT_HEIGHT,
+    START_ERROR,
+    ArmState,
+    Limits,
+    refuse_lift,
+    refuse_motion,
+    refuse_pose,
+    refuse_state,
+)
 
 
 @pytest.fixture
@@ -70,6 +79,18 @@ def test_motions_that_may_not_be():
     for pose in (np.zeros(5), np.full(6, np.inf)):
         with pytest.raises(DeviceError, match="six finite"):
             refuse_pose(pose)
+
+
+def test_limits_leave_room_to_lift():
+    for height in np.arange(0.05, 0.15, 0.01).astype(np.float32):
+        enough = f"{height + LIFT_HEIGHT + START_ERROR:g}"
+        roomy = Limits(high_m=(0.3, 0.3, float(enough)), step_m=LIFT_HEIGHT)
+        refuse_lift(roomy, float(height))
+        start = np.array([0.0, 0.0, height], float)
+        refuse_motion(start, start + [0.0, 0.0, LIFT_HEIGHT], speed=0.1, acceleration=0.5, limits=roomy)  # noqa: RUF005
+        for tight in (Limits(high_m=(0.3, 0.3, float(enough) - 0.005)), Limits(step_m=LIFT_HEIGHT - 0.005)):
+            with pytest.raises(ValueError, match=f"allowed is a third number of {enough} and more"):
+                refuse_lift(tight, float(height))
 
 
 def test_a_dry_cell_says_what_it_would_send(decider: Decider):

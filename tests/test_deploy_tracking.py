@@ -71,10 +71,30 @@ def test_what_is_nowhere_is_nothing_that_was_there():
     assert match(things(MUG), things((0.31, 0.0, 400.0, 0.1))) == [None], "nothing moves that far"
 
 
+@pytest.mark.parametrize(
+    ("before", "now"),
+    [
+        ([(0.0, 0.0, 400.0, 0.1), (0.2, 0.0, 400.0, 0.1)], [(0.19, 0.0, 400.0, 0.1), (0.05, 0.0, 400.0, 0.1)]),
+        ([(0.0, 0.0, 400.0, 0.1), (0.0, 0.0, 900.0, 0.1)], [(0.0, 0.0, 850.0, 0.1), (0.0, 0.0, 450.0, 0.1)]),
+        ([(0.0, 0.0, 400.0, 0.1), (0.0, 0.0, 400.0, 0.2)], [(0.0, 0.0, 400.0, 0.19), (0.0, 0.0, 400.0, 0.11)]),
+    ],
+    ids=["way", "size", "height"],
+)
+def test_each_of_these_alone_tells_two_objects_apart(before, now):
+    assert match(things(*before), things(*now)) == [1, 0]
+
+
+def test_something_else_is_no_target_that_is_gone():
+    known, wanted = Known(("", ""), things(MUG, BOX), 0), Target(index=0)
+    for appeared in ((0.2, 0.0, 3000.0, 0.1), (0.05, 0.0, 90.0, 0.1), (0.05, 0.0, 400.0, 0.17)):
+        with pytest.raises(ValueError, match=r"allowed is one within 0\.3 m of there and of about its size and height"):
+            find_target(wanted, masks("", ""), things(appeared, BOX), known)
+
+
 def test_things_are_where_the_scene_has_them():
     depth = SMALL.golden["depth"][0] * np.float32(1e-4)
-    ids, height, instances = SMALL.golden["instances"][0], SMALL.golden["height_m"][0], SMALL.golden["instances"][0]
-    found = sorted(set(np.unique(instances)) - {0})
+    ids, height = SMALL.golden["instances"][0], SMALL.golden["height_m"][0]
+    found = sorted(set(np.unique(ids)) - {0})
     images = Masks(np.stack([ids == value for value in found]), tuple(map(str, found)), np.ones(len(found)))
     images.masks[0] = False
     seen = things_of(images, SMALL.view.cut(depth), SMALL.view)
@@ -146,6 +166,18 @@ def test_a_trial_keeps_its_target_and_logs_what_ended_it(tmp_path: Path):
     }
     first, second = (np.load(tmp_path / "log" / f"decision-00{number}.npz")["labels"] for number in (0, 1))
     np.testing.assert_array_equal(first, second)
+
+
+def test_a_log_that_cannot_be_written_does_not_hide_why_the_robot_stopped(tmp_path: Path, monkeypatch):
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(DecisionLog, "conclude", full)
+    monkeypatch.setattr(DecisionLog, "keep", full)
+    with pytest.raises(DeviceError, match="stalled"):
+        station_of(Restless(), tmp_path / "log").run()
+    with pytest.raises(ValueError, match="the target was last seen at"):
+        station_of(Restless(forgetful=True), tmp_path / "other").run()
 
 
 def test_an_image_that_cannot_be_used_is_kept(tmp_path: Path):

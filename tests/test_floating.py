@@ -6,9 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.geometry import quat_from_yaw
 from pregrasp_jax.robot.base import ClosingRegion, Eligibility, first_obstruction, hand_pose_of
 from pregrasp_jax.robot.floating import JOINTS, make_floating_hand
+from pregrasp_jax.scene.model import make_slot_model
 from pregrasp_jax.scene.spec import compile_spec, scene_spec
 from pregrasp_jax.spaces.motion import minimum_jerk
 from pregrasp_jax.spaces.workspace import TABLE, Box, Workspace
@@ -142,6 +144,21 @@ def test_only_walls_are_kept_clear_of(robot):
 def test_the_first_name_that_holds_is_the_reason():
     holds = {"joint_limit": jnp.array([False, True, True]), "table": jnp.array([True, True, False])}
     assert [OBSTRUCTIONS[c] for c in first_obstruction(holds)] == ["table", "joint_limit", "joint_limit"]
+
+
+def test_a_hand_may_hold_meshes_and_geoms_without_names(robot):
+    """As what is left of a maker's file once its visual geoms are gone."""
+    corners = "0 0 0  1 0 0  0 1 0  0 0 1"
+    mjcf = GRIPPER.replace("<worldbody>", f'<asset><mesh name="m" vertex="{corners}"/></asset><worldbody>', 1)
+    kept = make(mjcf.replace('geom name="palm"', "geom"))
+    assert [geom.name for geom in kept.links.geoms].count("") == 0
+    assert len({geom.name for geom in kept.links.geoms}) == len(robot.links.geoms)
+    bank = builtin_bank("seen")
+    plain, with_mesh = (make_slot_model(scene_spec(hand, TABLE), bank) for hand in (robot, kept))
+    for name in ("geom_size", "geom_friction", "body_mass"):
+        np.testing.assert_array_equal(with_mesh.fields[name], plain.fields[name])
+    hulls = [[model.mj_model.mesh(i).name for i in model.fields["geom_dataid"][:, 0]] for model in (plain, with_mesh)]
+    assert hulls[0] == hulls[1]
 
 
 def test_refusals(robot):

@@ -94,6 +94,14 @@ def test_spaces_hold_what_comes_out(envs):
     assert all(infos["action_mask"][np.arange(SCENES), drawn] == 1)
 
 
+def test_a_seed_that_is_left_open_is_drawn(envs):
+    fixed, _ = envs.reset(seed=SEED)
+    some, _ = envs.reset(seed=[SEED, None])
+    again, _ = envs.reset(seed=[SEED, None])
+    np.testing.assert_array_equal(some["height"][0], fixed["height"][0])
+    assert not np.array_equal(some["height"][1], again["height"][1])
+
+
 def test_refusals_say_what_is_allowed(envs):
     envs.reset(seed=0)
     with pytest.raises(ValueError, match="allowed are 2 of 0 to 19999"):

@@ -142,12 +142,16 @@ def test_a_full_disk_costs_a_file_and_not_the_run(collection, tmp_path, monkeypa
     config, said = make_config(collection=str(collection), epochs=1), []
     env: Any = types.SimpleNamespace(primitive=types.SimpleNamespace(actions=ACTIONS))
     full = {"is": False}
-    real = imitation.save
 
-    def crammed(*args: Any, **options: Any) -> Any:
-        if full["is"]:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return real(*args, **options)
+    def cram(owner: Any, name: str) -> None:
+        write = getattr(owner, name)
+
+        def crammed(*args: Any, **options: Any) -> Any:
+            if full["is"]:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return write(*args, **options)
+
+        monkeypatch.setattr(owner, name, crammed)
 
     def learn(session: Any) -> bool:
         full["is"] = True
@@ -156,15 +160,15 @@ def test_a_full_disk_costs_a_file_and_not_the_run(collection, tmp_path, monkeypa
         full["is"] = False
         return True
 
-    monkeypatch.setattr(imitation, "save", crammed)
-    monkeypatch.setattr(imitation, "save_policy", crammed)
+    cram(imitation, "save")
+    cram(imitation, "save_policy")
     monkeypatch.setattr(imitation._Session, "learn", learn)
     console: Any = types.SimpleNamespace(say=said.append, start=lambda: None)
     with RunFolder.create(tmp_path / "run", config) as folder:
-        monkeypatch.setattr(folder, "append_metrics", crammed)
+        cram(folder, "append_metrics")
         ending = imitation.run(config, env, folder, console, resumed=False, stop=lambda: False)
     warnings = [line for line in said if line.startswith("warning: no ")]
-    assert ending.startswith("done:")
+    assert ending.startswith("done:") and load_policy(tmp_path / "run" / "best").evaluation["start_loss"] > 0
     assert [line.split()[2] for line in warnings] == ["policy", "metrics", "checkpoint"]
     assert all("(No space left on device: " in line and line.endswith("the run goes on") for line in warnings)
 

@@ -21,7 +21,18 @@ import pregrasp_jax
 ROOT = Path(__file__).parent.parent
 
 SOURCES = ("LICENSE", "CITATION.cff", "CHANGELOG.md", "README.md", "MANIFEST.in", "Makefile", "constraints.txt")
-SOURCES += ("pyproject.toml", "train.py", "evaluate.py", "pregrasp_jax", "mjcf", "benchmarks", "docs", "tests", ".ci")
+SOURCES += (
+    "pyproject.toml",
+    "train.py",
+    "evaluate.py",
+    "pregrasp_jax",
+    "mjcf",
+    "benchmarks",
+    "docs",
+    "examples",
+    "tests",
+    ".ci",
+)
 """What a checkout holds; runs, caches and what earlier builds have left do not belong to it."""
 
 
@@ -82,7 +93,10 @@ def test_files_of_a_release_are_where_they_belong(built: Built):
     assert f"pregrasp_jax-{pregrasp_jax.__version__}.dist-info/licenses/LICENSE" in wheel
     assert "pregrasp_jax/mjcf/table.xml" in wheel and "mjcf/table.xml" in sdist
     assert {"LICENSE", "CITATION.cff", "constraints.txt", "train.py", "tests/conftest.py", "docs/task.md"} <= sdist
-    assert not [name for name in wheel if name.startswith(("tests", "benchmarks", "docs", "train", "evaluate"))]
+    assert "examples/own_hand.py" in sdist
+    assert not [
+        name for name in wheel if name.startswith(("tests", "benchmarks", "docs", "examples", "train", "evaluate"))
+    ]
     assert not [name for name in wheel | sdist if "__pycache__" in name]
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "pregrasp_jax").rglob("*.py")}
     assert modules <= wheel, "every folder of modules is named in pyproject.toml"

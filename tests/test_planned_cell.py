@@ -10,6 +10,7 @@ import pytest
 from bundles import SMALL, small_bundle, small_decider
 
 from pregrasp_jax import planned_cell
+from pregrasp_jax.checkpoint import load_policy
 from pregrasp_jax.cli.main import main
 from pregrasp_jax.deploy.cell import Cell
 from pregrasp_jax.deploy.files import masks_of_ids
@@ -271,6 +272,23 @@ def test_a_bundle_without_parameters_cannot_be_searched_by():
         ValueError, match=r"has no policy.safetensors; allowed is a bundle exported with --formats onnx sa"
     ):
         planned_cell.make_search(bundle, PlanningConfig(), decider=small_decider(), camera_m=np.zeros(3))
+
+
+def test_a_search_needs_no_file_of_the_machine_that_trained(monkeypatch: pytest.MonkeyPatch):
+    trained = load_policy(SMALL.bundle.folder)
+    task = dataclasses.replace(trained.config.task, camera="pinhole", sensor="/gone/mine.yaml")
+    trained = dataclasses.replace(trained, config=dataclasses.replace(trained.config, task=task))
+
+    class BuiltError(Exception):
+        pass
+
+    def make_planner(env: Any, *_: Any, **__: Any) -> Any:
+        raise BuiltError(env.task.camera)
+
+    monkeypatch.setattr(planned_cell, "load_policy", lambda _: trained)
+    monkeypatch.setattr(planned_cell, "make_planner", make_planner)
+    with pytest.raises(BuiltError, match="pinhole"):
+        planned_cell.make_search(SMALL.bundle, PlanningConfig(), decider=small_decider(), camera_m=np.zeros(3))
 
 
 @pytest.mark.slow

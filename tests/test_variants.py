@@ -46,6 +46,13 @@ def test_a_bottle_is_cut_where_it_is_not_convex_and_nowhere_else():
     np.testing.assert_allclose([volume(part) for part in parts], expected, rtol=1e-6)
 
 
+def test_objects_of_which_nothing_can_be_made_are_one_line():
+    pencil = shapes.solid([(1.0, 0.0), (1.0, 0.12)], shapes.superellipse(0.02, 0.02, 2.0, shapes.SECTIONS))
+    with pytest.raises(ValueError, match=r"no object of the kind 'scaled' can be made of these objects .*a base of"):
+        for index in range(20):
+            variants.draw_variant([pencil], index, seed=SEED)
+
+
 def test_the_two_sides_of_a_cut_are_the_whole(known):
     for part in known[2]:
         for z in np.linspace(part[:, 2].min() + 0.01, part[:, 2].max() - 0.01, 4):

@@ -1,18 +1,19 @@
 """Which files of a folder are meshes, which of several is an object's, and what is not used."""
 
 import os
+import re
 from collections import Counter
 from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
 from pregrasp_jax.assets.formats import SUFFIXES
-from pregrasp_jax.assets.settings import SETTINGS_FILE, same_form
+from pregrasp_jax.assets.settings import SETTINGS_FILE, refuse_inside_objects, same_form
 
 _DEPTH = 3
 """Folders below that of an object in which its mesh may lie: object/meshes/visual."""
 
-_SIMPLIFIED = ("collision", "coacd", "vhacd", "convex", "hull", "_col", "coll.")
+_SIMPLIFIED = re.compile(r"collision|coacd|vhacd|convex|hull|_col(?![a-z])|coll\.")
 """In a name they mark meshes that somebody has simplified; the original is read where there is one."""
 
 _UNREAD = {
@@ -59,6 +60,9 @@ def find_meshes(folder: Path, listed: Collection[str]) -> Contents:
     Args:
         folder: of one object set.
         listed: the keys of `objects.yaml`; of several meshes of a folder the listed one is taken.
+
+    Raises:
+        ValueError: settings lie in the folder of an object.
     """
     entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     subfolders = [path for path in entries if path.is_dir() and path.suffix.lower() not in SUFFIXES]
@@ -78,6 +82,7 @@ def find_meshes(folder: Path, listed: Collection[str]) -> Contents:
             others += [(path, why) for path in candidates if path != chosen]
         elif not inner:
             others.append((subfolder, "empty folders"))
+    refuse_inside_objects(files, folder)
     unread = [_key(path, folder) for path in files if path.suffix.lower() in _UNREAD]
     others += [(path, why) for path in files if (why := _why_unused(path))]
     return Contents(_uniquely_named(found), unread, _lines(others))
@@ -100,14 +105,18 @@ def _files_below(folder: Path) -> list[Path]:
 def _rank(path: Path, folder: Path, listed: Collection[str]) -> tuple:
     """Order the meshes of one object: a listed one, one that is not simplified, then by format and name."""
     key = _key(path, folder)
-    simplified = any(word in key.lower() for word in _SIMPLIFIED)
+    simplified = bool(_SIMPLIFIED.search(key.lower()))
     return key not in listed, simplified, SUFFIXES.index(path.suffix.lower()), key
 
 
 def _uniquely_named(found: list[MeshFile]) -> list[MeshFile]:
-    """Name objects whose names would be the same by their keys."""
-    counts = Counter(mesh.name for mesh in found)
-    named = [mesh if counts[mesh.name] == 1 else mesh._replace(name=mesh.key) for mesh in found]
+    """Name objects whose names would be the same by their keys, and those that are called like such a key."""
+    named = found
+    while clashing := {name for name, count in Counter(mesh.name for mesh in named).items() if count > 1}:
+        renamed = [mesh._replace(name=mesh.key) if mesh.name in clashing else mesh for mesh in named]
+        if renamed == named:  # two keys are the same, which is refused later
+            break
+        named = renamed
     return sorted(named, key=lambda mesh: mesh.key)
 
 

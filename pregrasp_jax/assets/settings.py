@@ -12,7 +12,7 @@ import math
 import re
 import unicodedata
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -81,6 +81,17 @@ def refuse_beside_sets(folder: Path, sets: Sequence[str]) -> None:
         if _MEANT_AS_SETTINGS.fullmatch(path.name.lower()):
             places = " and ".join(str(folder / name / SETTINGS_FILE) for name in sets)
             raise ValueError(f"{path}: not read, since it lies beside {sets[0]}; allowed is {places}")
+
+
+def refuse_inside_objects(paths: Iterable[Path], folder: Path) -> None:
+    """Refuse settings among the files of objects' own folders, where they would not be read.
+
+    Raises:
+        ValueError: there are some.
+    """
+    for path in paths:
+        if path.parent != folder and _MEANT_AS_SETTINGS.fullmatch(path.name.lower()):
+            raise ValueError(f"{path}: not read; allowed is {folder / SETTINGS_FILE}, which lists {path.parent.name}")
 
 
 def same_form(name: str) -> str:

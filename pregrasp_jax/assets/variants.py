@@ -5,7 +5,6 @@ Object i of a stream depends on the known objects, the seed and i alone, so a la
 
 import warnings
 from collections.abc import Callable, Sequence
-from itertools import count
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -35,6 +34,10 @@ MAX_SIDE = 0.145
 
 MIN_BASE, MAX_SLENDERNESS = 0.034, 4.2
 """m, narrowest width of the base; height per such width. The catalogue has 4.1."""
+
+
+_TRIES = 2000
+"""Draws of one object; of the built-in ones a few are enough."""
 
 
 def variant_bank(
@@ -79,14 +82,24 @@ def draw_variant(known: Sequence[Parts], index: int, *, seed: Sequence[int]) -> 
         known: parts of the objects that some are made from.
         index: which.
         seed: of the stream.
+
+    Raises:
+        ValueError: nothing of the family can be made of the known objects.
     """
     rng = np.random.default_rng([*seed, index])
     shares = np.array([share for _, share in FAMILIES.values()])
     name = list(FAMILIES)[rng.choice(len(shares), p=shares / shares.sum())]
     draw = FAMILIES[name][0]
     density = rng.uniform(*DENSITY)
-    parts = next(parts for _ in count() if not why_not(parts := draw(rng, known), density))
-    return ConvexObject(f"made_{index:04d}_{name}", parts, density=density)
+    why = ""
+    for _ in range(_TRIES):
+        parts = draw(rng, known)
+        if not (why := why_not(parts, density)):
+            return ConvexObject(f"made_{index:04d}_{name}", parts, density=density)
+    raise ValueError(
+        f"no object of the kind {name!r} can be made of these objects (the last of {_TRIES} tries has {why}); allowed "
+        "is assets.variants = 0, or objects of which some would stand if they were scaled"
+    )
 
 
 def why_not(parts: Parts, density: float) -> str:

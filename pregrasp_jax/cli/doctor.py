@@ -68,7 +68,7 @@ def _describe_guard() -> str:
     value = os.environ.get("NPROC")
     origin = "pregrasp_jax" if pregrasp_jax.NPROC_BY_GUARD else "the environment"
     said = f"{value}, set by {origin}" if value else "unset"
-    if max(_num_cores(), pregrasp_jax.num_threads_asked()) >= 4:
+    if (pregrasp_jax.num_threads_asked() or _num_cores()) >= 4:
         return f"{said}: enough threads for XLA"
     return f"{said}: MJX may deadlock; set NPROC=4 before Python starts"
 

@@ -32,7 +32,8 @@ class FileSource:
 
     def capture(self) -> tuple[np.ndarray, np.ndarray | None, float]:
         """Return the newest image; see `ImageSource.capture`."""
-        after, there = (time.time(), _written(self._depth)) if self._fresh else (self._last, None)
+        after = time.time() if self._fresh else self._last
+        there = _written(self._depth) if self._fresh else None
 
         def is_new(written: float) -> bool:
             return written > after and written != there

@@ -24,6 +24,10 @@ TCP_ERROR = 0.002
 """m; how far the controller's tool centre point may be from the contract's."""
 
 
+_ROUNDING = 1e-6
+"""m by which a motion that was commanded to be as long as is allowed may seem longer."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Limits:
     """What a motion may be; lengths in the table frame."""
@@ -120,7 +124,7 @@ def refuse_motion(start: np.ndarray, end: np.ndarray, *, speed: float, accelerat
                 f"{list(limits.high_m)}"
             )
     length = float(np.linalg.norm(np.subtract(end, start)))
-    if length > limits.step_m:
+    if length > limits.step_m + _ROUNDING:
         raise DeviceError(f"a motion is {length:.3f} m long; allowed is {limits.step_m:g} m")
     if not 0 < speed <= limits.speed_m_s:
         raise DeviceError(f"a motion's speed is {speed:g} m/s; allowed is above 0 to {limits.speed_m_s:g}")
@@ -138,7 +142,7 @@ def refuse_lift(limits: Limits, height_m: float) -> None:
     Raises:
         ValueError: the box is too low, or the longest motion too short.
     """
-    highest = height_m + LIFT_HEIGHT + START_ERROR
+    highest = round(height_m + LIFT_HEIGHT + START_ERROR, 3)
     if limits.high_m[2] < highest or limits.step_m < LIFT_HEIGHT:
         raise ValueError(
             f"robot.limits.high_m = {list(limits.high_m)} and step_m = {limits.step_m:g} leave no room to lift what is "

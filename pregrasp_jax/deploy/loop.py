@@ -1,5 +1,6 @@
 """Look, decide, push, look again; close when the target is enclosed."""
 
+import contextlib
 import functools
 import time
 from collections.abc import Callable, Mapping
@@ -97,7 +98,8 @@ class Station:
         try:
             result = self._trial(once=once)
         except (DeviceError, ValueError) as error:
-            self._conclude({"reason": "error", "error": one_line(error)})
+            with contextlib.suppress(OSError):  # a full disk must not hide why the robot has stopped
+                self._conclude({"reason": "error", "error": one_line(error)})
             raise
         self._conclude(result._asdict())
         self.say(f"{result.reason.replace('_', ' ')} after {result.pushes} pushes")
@@ -141,14 +143,15 @@ class Station:
 
         Raises:
             DeviceError: a device cannot go on.
-            ValueError: what is seen cannot be used; the log keeps the image.
+            ValueError: an image cannot be read, or what it shows cannot be used; in that case the log keeps it.
         """
         frame = self._capture()
         try:
             return self._decide(frame, hand, pushes, known)
         except ValueError:
-            if self.log is not None:
-                self.log.keep(pushes, frame)
+            with contextlib.suppress(OSError):
+                if self.log is not None:
+                    self.log.keep(pushes, frame)
             raise
 
     def _decide(self, frame: Frame, hand: motion.Held, pushes: int, known: Known | None) -> Looked:

@@ -33,7 +33,7 @@ class TabletopSegmenter:
         self._view, self._body, self._entry, self._scale = view, body, entry, scale
 
     def segment(self, frame: Frame) -> Masks:
-        """Return one mask per component, the largest first; they are called 0, 1, 2, ..."""
+        """Return one mask per component, the largest first; none has a name of its own."""
         depth = depth_in_metres(frame.depth, scale=self._scale, shape=self._view.camera.shape)
         blank = np.zeros(depth.shape, np.uint8)
         maps = project(depth, blank, view=self._view, body=self._body, joint_pos=frame.joint_pos, entry=self._entry)
@@ -44,7 +44,7 @@ class TabletopSegmenter:
         for mask, part in zip(masks, parts, strict=True):
             self._view.cut(mask)[:] = np.append(part.ravel(), False)[cells]
         sizes = np.array([part.sum() for part in parts], float)
-        return Masks(masks, tuple(map(str, range(len(parts)))), sizes / max(sizes.max(initial=0.0), 1.0))
+        return Masks(masks, ("object",) * len(parts), sizes / max(sizes.max(initial=0.0), 1.0))
 
 
 def components(height: np.ndarray, standing: np.ndarray) -> list[np.ndarray]:

@@ -33,6 +33,9 @@ DOF_FIELDS = ("dof_invweight0", "dof_M0")
 """Of a slot's body and its degrees of freedom; these and the last two of the body are what `mj_setConst` derives."""
 
 
+_PADS = ("hand_left_pad", "hand_right_pad")
+"""Geoms of the RG2 that hold a target."""
+
 PAD_FRICTION, PAD_IMPEDANCE = 2**0.5, (0.995, 0.9995)
 """Of the finger pads. A pyramid of friction 1 lies within the cone of friction 1, one of sqrt(2) around it; and without
 `impratio` only harder contacts slip less. Of 84 grasps of objects that stand up to 1 cm before the palm 86 % hold with
@@ -165,7 +168,7 @@ def _choose_solver(option: Any, geoms: Iterable[Any]) -> None:
     option.iterations, option.ls_iterations = ITERATIONS, LS_ITERATIONS
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     for geom in geoms:
-        if geom.name.endswith("_pad"):
+        if geom.name in _PADS:
             geom.friction[0], geom.solimp[:2] = PAD_FRICTION, PAD_IMPEDANCE
 
 

@@ -16,7 +16,7 @@ from pregrasp_jax.physics import native
 from pregrasp_jax.planning.solids import NUM_SIDES, Frustums, hull_bank
 from pregrasp_jax.robot.base import Robot
 from pregrasp_jax.scene import model as slot_model
-from pregrasp_jax.scene.model import SlotModel
+from pregrasp_jax.scene.model import SlotModel, first_hull
 from pregrasp_jax.spaces.workspace import Workspace
 from pregrasp_jax.types import MAX_HULLS, MAX_OBJECTS, HullBank
 
@@ -118,6 +118,7 @@ class _Writer:
         mj_model = model.mj_model
         self._model = model
         meshes = np.arange(MAX_OBJECTS * MAX_HULLS).reshape(MAX_OBJECTS, MAX_HULLS)  # one for every geom of a slot
+        meshes += first_hull(mj_model)
         self._vertex_ids = mj_model.mesh_vertadr[meshes][..., None] + np.arange(_NUM_VERTICES)
         self._polygon_ids, self._face_ids = self._polygons(mj_model, meshes)
         self._mesh_ids = meshes

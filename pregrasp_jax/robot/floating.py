@@ -117,7 +117,8 @@ def _carried(name: str, mjcf: str) -> mujoco.MjSpec:
             f"the body of hand {name} stands at {root.pos.tolist()}, turned by {root.quat.tolist()}; allowed is the "
             "origin, as it is held: move what is in it"
         )
-    for geom in hand.geoms:
+    for index, geom in enumerate(hand.geoms):
+        geom.name = geom.name or f"geom_{index}"  # engines look geoms up by their names
         geom.contype, geom.conaffinity = 2, 1  # objects and the table, not itself: as in mjcf/SOURCES.md
     for body in hand.bodies:
         body.gravcomp = 1

@@ -170,6 +170,7 @@ def _tabulate(mj_model: mujoco.MjModel, bank: HullBank) -> dict[str, np.ndarray]
     present = hulls >= 0
     present = np.vstack([present, np.zeros((1, MAX_HULLS), bool)])
     mesh_ids = np.vstack([np.where(hulls >= 0, hulls, hulls[:, :1]), np.zeros((1, MAX_HULLS), hulls.dtype)])
+    mesh_ids += first_hull(mj_model)
     geom_ids = np.vectorize(geom_of_mesh.__getitem__)(mesh_ids)
     friction = np.append(np.asarray(bank.friction, np.float64), 0.0)
     fields = {name: getattr(mj_model, name)[geom_ids].copy() for name in (*GEOM_FIELDS, RBOUND)}
@@ -185,6 +186,11 @@ def _tabulate(mj_model: mujoco.MjModel, bank: HullBank) -> dict[str, np.ndarray]
     fields["body_iquat"] = np.vstack([quat / np.linalg.norm(quat, axis=1, keepdims=True), [[1.0, 0.0, 0.0, 0.0]]])
     fields["body_gravcomp"] = np.append(np.zeros(len(bank.mass)), 1.0)
     return fields
+
+
+def first_hull(mj_model: mujoco.MjModel) -> int:
+    """Return the id of the first hull's mesh; the others follow, those that a robot's MJCF holds come before."""
+    return int(mj_model.mesh("hull_0").id)
 
 
 def _is_hull(mj_model: mujoco.MjModel, geom: int) -> bool:

@@ -34,9 +34,10 @@ class Things(NamedTuple):
 
 
 def match(before: Things, now: Things) -> list[int | None]:
-    """Return, for every object that is seen now, which of those before it is; None for a new one.
+    """Return, for every object that is seen now, which one before it most likely is; None if none is left for it.
 
-    The assignment as a whole makes way and change of size and height smallest; nothing moves farther than `FAR`.
+    The assignment as a whole makes way and change of size and height smallest; nothing moves farther than `FAR`. An
+    object that is new takes the place of one that is gone, if that was so near.
     """
     way = np.linalg.norm(now.xy[:, None] - before.xy, axis=-1)
     size = np.abs(np.log(now.size[:, None] / before.size))

@@ -97,6 +97,8 @@ def run(config: Config, env: Env, folder: RunFolder, console: Console, *, resume
     learned = collected and session.learn()
     if collected:
         session.save()
+    if learned:
+        session.save_best()
     if not learned:
         return f"interrupted at step {session.counters.step}; continue with `{command('train', 'resume', folder.path)}`"
     losses = ", ".join(f"{name} {loss:.3g}" for name, loss in session.counters.best.items())
@@ -161,6 +163,15 @@ class _Session:
         ring = Ring(self.positives, self.counters.written)
         extra = dataclasses.asdict(self.counters)
         save(self.folder.checkpoints, self.counters.step, self.state, ring, extra, policy="best/")
+
+    def save_best(self) -> None:
+        """Write the best policy.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        losses = {f"{name}_loss": loss for name, loss in self.counters.best.items()}
+        save_policy(self.folder.best, self.state["best"], self.config, {"env_steps": self.counters.step, **losses})
 
     def collect(self) -> bool:
         """Attempt strokes until enough of them were stable; return whether there was time to."""
@@ -233,8 +244,7 @@ class _Session:
             if loss < best.get(name, np.inf):
                 best[name] = loss
                 self.state["best"] = {**self.state["best"], name: params[name]}
-        evaluation = {"env_steps": self.counters.step, **{f"{name}_loss": loss for name, loss in best.items()}}
-        self._write("policy", lambda: save_policy(self.folder.best, self.state["best"], self.config, evaluation))
+        self._write("policy", self.save_best)
         self._append({f"eval/{name}_loss": loss for name, loss in losses.items()})
         self.console.say(f"update {self.counters.updates}: validation loss {_listed(losses)}")
 

@@ -26,7 +26,7 @@ from pregrasp_jax.checkpoint.run_config import (
     write_config,
 )
 from pregrasp_jax.checkpoint.state import exists
-from pregrasp_jax.config import Config
+from pregrasp_jax.config import Config, with_absolute_paths
 from pregrasp_jax.machine import versions
 from pregrasp_jax.messages import command
 from pregrasp_jax.settings import difference, to_dict
@@ -96,7 +96,7 @@ class RunFolder:
                 than it was made with, be it that of `config` or that of an edited config.yaml; the latter two list the
                 difference.
         """
-        if refused := fixed_difference(stored_config(path), config):
+        if refused := fixed_difference(with_absolute_paths(stored_config(path)), config):
             raise ValueError(
                 f"run {path} cannot be resumed with a changed configuration ({'; '.join(refused)}); {WHAT_MAY_CHANGE}"
             )

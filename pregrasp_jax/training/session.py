@@ -229,6 +229,9 @@ def _imitate(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
             ending = imitation.run(
                 config, env, folder, console, resumed=resumed, stop=lambda: interrupt.exit_code is not None
             )
+        except OSError as error:
+            console.say(f"the run ends, since nothing can be written ({error.strerror}: {folder.path})")
+            return 1
         finally:
             console.close()
         console.say(ending)
