@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from pregrasp_jax import io
-from pregrasp_jax.assets import decompose
+from pregrasp_jax.assets import bodies, decompose
 from pregrasp_jax.assets.bank import FORMAT, ConvexObject, concatenate, load_about, load_bank, make_bank, save_bank
 from pregrasp_jax.assets.fit import Fit, fit_parts
 from pregrasp_jax.assets.folder import find_meshes
@@ -332,4 +332,4 @@ def _finish(made: _Prepared) -> _Loaded | str:
             f"does not stand: tips over at {angle:.2f} rad, must be >= {MIN_TIP_ANGLE}; "
             f"another up axis ({', '.join(UP_AXES)}) can be set in {SETTINGS_FILE}"
         )
-    return _Loaded(bank, made.fit, tuple(filter(None, (made.doubt, made.fit.remark()))))
+    return _Loaded(bank, made.fit, tuple(filter(None, (made.doubt, made.fit.remark(), bodies.remark(made.item.parts)))))
