@@ -4,11 +4,10 @@ The docstring under a field is its command-line help. `Config.validate` is calle
 the program, so that a value out of range is one line before anything compiles.
 """
 
-import dataclasses
 import operator
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from pregrasp_jax.ranges import RANGES
@@ -24,9 +23,6 @@ Normalization = Literal["none", "batch"]
 
 STYLES = ("ppg", "target-ppg")
 """Ways of playing a policy of strokes, and names of the one that ships."""
-
-VALUES_DEPEND_ON = ("learner.discount", "train.try_grasps", "task.in_region_reward", "task.approach_reward")
-"""Settings that decide what a value means."""
 
 PUSHING = ("pretrained", "cpu-1")
 """Names of the policies of pushes that ship: the best, and what the preset `cpu` makes with seed 1 in 100 minutes."""
@@ -220,8 +216,7 @@ class ExplorationConfig:
     epsilon_fraction: float = 1 / 9
     """Share of the run over which epsilon falls."""
     guided: bool = True
-    """Random actions aim at the target inside the half ring; False draws from all that the
-    network values (Random-Exp ablation)."""
+    """Random actions aim at the target in the half ring; False draws from all that the network values (Random-Exp)."""
     angle_std: float = 0.5
     """rad, spread of guided actions around the direction to the target."""
     open_probability: float = 0.7
@@ -345,14 +340,11 @@ class Config:
 
 def with_absolute_paths(config: Config) -> Config:
     """Return a config whose folders and files mean the same from any working directory."""
-    folder, sensor, collection = config.assets.object_dir, config.task.sensor, config.strokes.collection
-    if folder is not None:
-        assets = dataclasses.replace(config.assets, object_dir=os.path.abspath(folder))
-        config = dataclasses.replace(config, assets=assets)
-    if sensor.endswith((".yaml", ".yml")):
-        config = dataclasses.replace(config, task=dataclasses.replace(config.task, sensor=os.path.abspath(sensor)))
-    if collection is not None:
-        config = dataclasses.replace(
-            config, strokes=dataclasses.replace(config.strokes, collection=os.path.abspath(collection))
-        )
-    return config
+    assets, task, strokes = config.assets, config.task, config.strokes
+    if assets.object_dir is not None:
+        assets = replace(assets, object_dir=os.path.abspath(assets.object_dir))
+    if task.sensor.endswith((".yaml", ".yml")):
+        task = replace(task, sensor=os.path.abspath(task.sensor))
+    if strokes.collection is not None:
+        strokes = replace(strokes, collection=os.path.abspath(strokes.collection))
+    return replace(config, assets=assets, task=task, strokes=strokes)

@@ -16,7 +16,6 @@ from pregrasp_jax.assets.bank import select
 from pregrasp_jax.assets.catalogue import builtin_bank
 from pregrasp_jax.assets.decompose import BASE_BAND, decompose, flatten_base, repair
 from pregrasp_jax.assets.fit import Fit
-from pregrasp_jax.assets.folder import find_meshes
 from pregrasp_jax.assets.hulls import volume
 from pregrasp_jax.assets.mesh_file import load_mesh
 from pregrasp_jax.assets.meshes import LoadedDir, Note, Refusal, load_object_dir
@@ -202,37 +201,6 @@ def test_a_folder_for_each_object(tmp_path, monkeypatch):
         "map.png, textured.mtl (2 times), a.mtl: materials and textures; only shapes are read",
         "model.urdf: descriptions; scale, up, mass and friction are set in objects.yaml",
     ]
-
-
-def test_the_original_is_read_before_what_was_simplified(tmp_path):
-    for name in ("can/model.obj", "can/a_collision_0.obj", "can/z/model.stl"):
-        write(tmp_path / "set" / name, box())
-    (found,) = find_meshes(tmp_path / "set", ()).meshes
-    assert (found.name, found.key) == ("can", "can/model.obj")
-    for name in ("lid/lid_color.ply", "lid/lid_vhacd.obj", "pot/pot_col.obj", "pot/pot.ply"):
-        write(tmp_path / "others" / name, box())
-    keys = [mesh.key for mesh in find_meshes(tmp_path / "others", ()).meshes]
-    assert keys == ["lid/lid_color.ply", "pot/pot.ply"], "a colour is no collision shape"
-
-
-def test_objects_have_names_of_their_own_whatever_files_are_called(tmp_path):
-    for name in ("a.obj", "a.stl", "a.obj.stl", "b.stl"):
-        write(tmp_path / "set" / name, box())
-    names = [mesh.name for mesh in find_meshes(tmp_path / "set", ()).meshes]
-    assert names == ["a.obj", "a.obj.stl", "a.stl", "b"]
-
-
-def test_settings_in_an_objects_own_folder_are_refused(tmp_path):
-    write(tmp_path / "set" / "mug" / "mug.obj", box())
-    inside = tmp_path / "set" / "mug" / "objects.yaml"
-    inside.write_text("mug.obj: {mass: 0.9}")
-    (tmp_path / "set" / "objects.yaml").write_text("mug: {mass: 0.9}")
-    with pytest.raises(
-        ValueError, match=r"mug/objects\.yaml: not read; allowed is .*/set/objects\.yaml, which lists mug"
-    ):
-        find_meshes(tmp_path / "set", ())
-    inside.unlink()
-    assert len(find_meshes(tmp_path / "set", ()).meshes) == 1
 
 
 def test_meshes_beside_the_folders_of_the_sets_are_told(tmp_path, monkeypatch):

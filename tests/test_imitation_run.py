@@ -22,7 +22,7 @@ from pregrasp_jax.evaluation.clearing import Cleared, summary
 from pregrasp_jax.presets import PRESETS
 from pregrasp_jax.task.push_grasp import stroke_actions
 from pregrasp_jax.training import imitation, session
-from pregrasp_jax.training.imitation import copy_positives, split
+from pregrasp_jax.training.demonstrations import copy_positives, split
 from pregrasp_jax.training.run_folder import RunFolder
 from pregrasp_jax.training.stroke_collection import blank_positives
 

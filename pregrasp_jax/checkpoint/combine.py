@@ -7,13 +7,15 @@ from typing import Any
 
 from pregrasp_jax import io
 from pregrasp_jax.checkpoint.policy import TrainedPolicy, load_policy, save_policy
-from pregrasp_jax.config import VALUES_DEPEND_ON
 from pregrasp_jax.learning.members import join, split
 from pregrasp_jax.ranges import RANGES
 from pregrasp_jax.settings import flatten, to_dict
 
 _FREE = ("network.members", "network.initial_bias")
 """Settings of the network that may differ."""
+
+VALUES_DEPEND_ON = ("learner.discount", "train.try_grasps", "task.in_region_reward", "task.approach_reward")
+"""Settings that decide what a value means."""
 
 
 def combine(policies: Sequence[Path | str], folder: Path, *, any_values: bool = False) -> TrainedPolicy:

@@ -106,11 +106,11 @@ class Planner:
         think = functools.partial(
             search, self._rollout, bank, roots, candidates, self._config, self._promise, left=left
         )
-        if not self._seconds:
+        if not self._seconds:  # the first decision compiles, which is no part of a later one, nor of a budget
             self._rollout.compile_grasp(bank, roots)
-        if self._config.budget_ms and not self._seconds:
-            think(deadline=math.inf)  # compiles, which is no part of a decision
-            begin = time.perf_counter()
+            if self._config.budget_ms:
+                think(deadline=math.inf)
+                begin = time.perf_counter()
         limit = self._config.budget_ms / 1e3 if self._config.budget_ms else math.inf
         found = think(deadline=begin + limit)
         self._seconds.append(time.perf_counter() - begin)

@@ -9,8 +9,9 @@ from typing import Any
 import jax
 
 from pregrasp_jax import io
+from pregrasp_jax.checkpoint.combine import VALUES_DEPEND_ON
 from pregrasp_jax.checkpoint.policy import load_policy
-from pregrasp_jax.config import VALUES_DEPEND_ON, Config, with_absolute_paths
+from pregrasp_jax.config import Config, with_absolute_paths
 from pregrasp_jax.evaluation import Evaluator
 from pregrasp_jax.evaluation.clearing import own_protocol
 from pregrasp_jax.learning.q_function import Params, make_q_function
@@ -20,7 +21,7 @@ from pregrasp_jax.settings import flatten, to_dict
 from pregrasp_jax.startup import prepare
 from pregrasp_jax.task.assembly import make_env
 from pregrasp_jax.task.env import Env
-from pregrasp_jax.training import imitation, processes, resources, trainer
+from pregrasp_jax.training import demonstrations, imitation, processes, resources, trainer
 from pregrasp_jax.training.console import Console
 from pregrasp_jax.training.dump import DumpFn, make_dump
 from pregrasp_jax.training.event_log import require_module
@@ -218,7 +219,7 @@ def _imitate(config: Config, run_dir: Path, folder: RunFolder | None, params: Pa
     if jax.process_count() > 1:
         raise ValueError("--distributed True is not known to train.method = imitation; allowed is one process")
     if folder is None and config.strokes.collection:
-        imitation.refuse_collection(config)
+        demonstrations.refuse_collection(config)
     resumed = folder is not None
     env = own_protocol(_load(config, "train", console))
     folder = folder or _create(run_dir, config)
