@@ -53,6 +53,14 @@ def fall(simulations: native.Simulations, object_ids: np.ndarray) -> np.ndarray:
     return after.object_poses[0]
 
 
+def two_towers(simulations: native.Simulations) -> np.ndarray:
+    """A state [nstate] in which one tower leans toward the other."""
+    state, poses = simulations.home_states()[0], parking_poses()
+    poses[:2] = [[0.1, 0, 0.0005, 1, 0, 0, 0], [0.1, 0.16, 0.035, 0.966, 0.259, 0, 0]]
+    simulations.coordinates(state)[0][simulations.model.slot_qpos_ids] = poses
+    return state
+
+
 @pytest.fixture(scope="module")
 def simulations() -> simulation.Simulations:
     return simulation.make_simulations(ROBOT, TABLE, num_variants=2, threads=1)
@@ -104,6 +112,39 @@ def test_every_simulation_runs_on_the_variant_of_its_objects(simulations: simula
     rows = [np.where(np.arange(MAX_OBJECTS) < 2, np.arange(MAX_OBJECTS) + v * MAX_OBJECTS, -1) for v in (1, 0)]
     one, other = (fall(simulations, row.astype(np.int32)) for row in rows)
     assert np.abs(one[:2] - other[:2]).max() > 1e-3
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_push_ends_as_it_does_alone_whoever_takes_it(threads: int):
+    """Seven falls of unlike length in two variants, and one scene that stands still."""
+    many = simulation.make_simulations(ROBOT, TABLE, num_variants=2, at_once=2, threads=threads)
+    alone = simulation.make_simulations(ROBOT, TABLE, num_variants=2, threads=1)
+    for simulations in (many, alone):
+        simulations.write(random_bank(0, variants=2))
+    start = two_towers(alone)
+    rows = np.array([20, 5, 0, 12, 18, 1, 8, 16])
+    ids = np.where(np.arange(MAX_OBJECTS) < 2, np.arange(MAX_OBJECTS) + np.arange(8)[:, None] % 2 * MAX_OBJECTS, -1)
+    ctrl = np.tile(np.append(ROBOT.home[:6], 1.2), (8, 20, 1))
+    states = np.tile(start, (8, 1))
+    runs = [many.run(states, ids, ctrl, rows) for _ in range(2)]  # nothing is left of the first
+    for scene in range(8):
+        one = slice(scene, scene + 1)
+        by_itself = alone.run(states[one], ids[one], ctrl[one], rows[one])
+        for together in runs:
+            for found, wanted in zip(together, by_itself, strict=True):
+                np.testing.assert_array_equal(found[one], wanted)
+    ends = runs[0][0]
+    np.testing.assert_array_equal(ends[2], start)
+    assert len({end.tobytes() for end in ends}) == 8, "variants and lengths differ"
+
+
+def test_a_push_that_goes_wrong_spoils_no_other(simulations: simulation.Simulations):
+    simulations.write(random_bank(0, variants=2))
+    states = np.tile(two_towers(simulations), (2, 1))
+    simulations.coordinates(states)[1][0, simulations.model.slot_dof_ids[0]] = 1e12
+    ids = np.where(np.arange(MAX_OBJECTS) < 2, np.arange(MAX_OBJECTS), -1)[None].repeat(2, axis=0)
+    ctrl = np.tile(np.append(ROBOT.home[:6], 1.2), (2, 5, 1))
+    assert simulations.run(states, ids, ctrl, np.array([5, 5]))[1].tolist() == [True, False]
 
 
 def test_an_empty_slot_touches_nothing(simulations: simulation.Simulations):

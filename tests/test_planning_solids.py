@@ -5,8 +5,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from pregrasp_jax.assets.measure import measure
-from pregrasp_jax.planning import outlines
-from pregrasp_jax.planning.separate import separate
+from pregrasp_jax.planning import outlines, separate
 from pregrasp_jax.planning.solids import (
     MIN_SIDE,
     NUM_SIDES,
@@ -38,6 +37,12 @@ def one(bottom: np.ndarray, top: np.ndarray, height: tuple[float, float] = (0.0,
 
 def many(*solids: Frustums) -> Frustums:
     return Frustums(*(np.stack(columns) for columns in zip(*solids, strict=True)))
+
+
+def separated(solids: Frustums, poses: np.ndarray, robot: np.ndarray) -> Frustums:
+    """The objects of one scene."""
+    found = separate.separate(many(solids), poses[None], robot)
+    return Frustums(*(leaf[0] for leaf in found))
 
 
 def test_vertices_lie_on_their_faces_and_make_a_convex_hull():
@@ -160,7 +165,7 @@ def test_objects_that_overlap_are_cut_back_where_it_takes_least():
     solids = many(square, square, square)
     poses = np.array([[0.0, 0.0, 0.0], [0.055, 0.0, 0.4], [0.3, 0.0, 0.0]])
     robot = np.array([[[-0.1, -0.01, z], [-0.025, -0.01, z], [-0.1, 0.01, z], [-0.025, 0.01, z]] for z in (0.05, 0.5)])
-    found = separate(solids, poses, robot.reshape(2, 4, 3)[:, :, :])
+    found = separated(solids, poses, robot.reshape(2, 4, 3))
     points = [corners(found.support[i, 0, 0], np.float64(poses[i, 2])) + poses[i, :2] for i in range(3)]
     # What separates them: the largest gap over the directions of either.
     gap = max((points[1] @ n).min() - (points[0] @ n).max() for n in directions(np.linspace(0, 0.4, 9)).reshape(-1, 2))
@@ -168,12 +173,25 @@ def test_objects_that_overlap_are_cut_back_where_it_takes_least():
     np.testing.assert_array_equal(found.support[2], tighten(solids.support[2]))  # one that touches nothing
 
 
+def test_scenes_do_not_depend_on_each_other():
+    square = one(np.full(NUM_SIDES, 0.03), np.full(NUM_SIDES, 0.02))
+    disc = one(ellipse(0.03, 0.04), ellipse(0.02, 0.03))
+    scenes = many(many(square, disc, square), many(disc, square, disc))
+    poses = np.array([[[0, 0, 0], [0.05, 0, 0.4], [0.3, 0, 0]], [[0.2, 0, 0], [0, 0.03, 1.0], [0, 0, 0]]])
+    finger = np.array([[[x, y, z] for x in (-0.01, 0.012) for y in (-0.01, 0.01) for z in (0.0, 0.2)]])
+    together = separate.separate(scenes, poses, finger)
+    for index in range(2):
+        alone = separated(Frustums(*(leaf[index] for leaf in scenes)), poses[index], finger)
+        np.testing.assert_allclose(together.support[index], alone.support, atol=1e-6)
+        assert (alone.support < scenes.support[index] - 1e-3).any()
+
+
 def test_what_is_cut_from_all_sides_stays_a_solid():
     """A finger that seems to stand in the middle of an object, and neighbours that seem to cover it."""
     square = one(np.full(NUM_SIDES, 0.03), np.full(NUM_SIDES, 0.02), angle=0.0)
     poses = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.4], [-0.01, 0.003, 1.0], [0.0, -0.01, 0.0]])
     finger = np.array([[[x, y, z] for x in (-0.01, 0.012) for y in (-0.01, 0.01) for z in (0.0, 0.2)]])
-    found = separate(many(square, square, square, square), poses, finger)
+    found = separated(many(square, square, square, square), poses, finger)
     assert (area(found.support[:, 0, 0]) > 2e-5).all() and (area(found.support[:, 0, 1]) > 2e-5).all()
     for i in range(4):
         around = corners(found.support[i, 0], np.zeros(2)).reshape(-1, 2)
@@ -186,7 +204,7 @@ def test_the_robot_cuts_only_what_is_as_high_as_it_is():
     square = one(np.full(NUM_SIDES, 0.03), np.full(NUM_SIDES, 0.03), angle=0.0)
     finger = np.array([[x, y, z] for x in (-0.1, -0.02) for y in (-0.01, 0.01) for z in (0.08, 0.12)])
     for lift, reach in ((0.0, -0.02), (0.1, -0.03)):
-        found = separate(many(square), np.zeros((1, 3)), finger[None] + [0, 0, lift])
+        found = separated(many(square), np.zeros((1, 3)), finger[None] + [0, 0, lift])
         assert corners(found.support[0, 0, 0], np.float64(0.0))[:, 0].min() == pytest.approx(reach, abs=5e-4)
 
 

@@ -112,44 +112,58 @@ class Simulations:
             The new state [E, nstate] and diverged [E] bool: an error or a warning of MuJoCo, or too deep a contact (as
             that of an object below the table is), in any physics step; not finite or too fast at the end.
         """
+        fine, num_steps = interpolate(ctrl, self.num_substeps), num_ctrl * self.num_substeps
         with self._lock:
-            batch, num_scenes = self._begin(state, object_ids), len(state)
-            fine = interpolate(ctrl, self.num_substeps)
-            failed, deep = np.zeros((2, num_scenes), bool)
-            start = 0
-            for stop in np.unique(num_ctrl[num_ctrl > 0]):
-                ids = np.flatnonzero((num_ctrl >= stop) & ~failed)
-                if ids.size == 0:
-                    break
-                rows = slice(start * self.num_substeps, stop * self.num_substeps)
-                sensed, errors = self._roll(ids, fine[ids, rows])
-                failed[errors] = True
-                deep[ids] |= sensed[..., 0].min(axis=1) < -self.max_penetration
-                failed |= batch.warning[:num_scenes].any(axis=(1, 2))
-                start = stop
-            new_state = batch.state[:num_scenes].copy()
-            speed = np.abs(batch.bind("qvel")[:num_scenes]).max(axis=1)
-        return new_state, failed | deep | ~(speed < MAX_SPEED) | ~np.isfinite(new_state).all(axis=1)
+            new_state, failed, deepest = self._simulate(state, object_ids, fine, num_steps)
+        speed = np.abs(self.coordinates(new_state)[1]).max(axis=1)
+        bad = (deepest < -self.max_penetration) | ~(speed < MAX_SPEED) | ~np.isfinite(new_state).all(axis=1)
+        return new_state, failed | bad
+
+    def _simulate(
+        self, state: np.ndarray, object_ids: np.ndarray, ctrl: np.ndarray, num_steps: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Step E scenes, with a control [E, S, A] for every step; the rest is as in `run`.
+
+        Returns:
+            The new state [E, nstate], failed [E] bool: an error or a warning, and the deepest contact [E], m.
+        """
+        batch, num_scenes = self._begin(state, object_ids), len(state)
+        failed, deepest = np.zeros(num_scenes, bool), np.zeros(num_scenes)
+        start = 0
+        for stop in np.unique(num_steps[num_steps > 0]):
+            ids = np.flatnonzero((num_steps >= stop) & ~failed)
+            if ids.size == 0:
+                break
+            sensed, errors = self._roll(batch, ids, ctrl[ids, start:stop])
+            failed[errors] = True
+            deepest[ids] = np.minimum(deepest[ids], sensed[..., 0].min(axis=1))
+            failed |= batch.warning[:num_scenes].any(axis=(1, 2))
+            start = stop
+        return batch.state[:num_scenes].copy(), failed, deepest
 
     def _begin(self, state: np.ndarray, object_ids: np.ndarray) -> Batch:
         """Put objects and states [E, nstate] into the first E simulations."""
         self.load(object_ids)
-        scenes = np.arange(len(state))
-        # The state does not say which objects sleep, so all are woken: the result depends on nothing before.
-        self._batch.reset(scenes, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        self._batch.state[scenes] = state
-        self._batch.warning[scenes] = 0
+        self._set(self._batch, np.arange(len(state)), state)
         return self._batch
 
-    def _roll(self, ids: np.ndarray, ctrl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Step simulations [n] with controls [n, T, A]; return sensors [n, T, S] and the simulations that failed.
+    @staticmethod
+    def _set(batch: Batch, ids: np.ndarray, state: np.ndarray) -> None:
+        """Put states [n, nstate] into simulations [n]."""
+        # The state does not say which objects sleep, so all are woken: the result depends on nothing before.
+        batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        batch.state[ids] = state
+        batch.warning[ids] = 0
+
+    def _roll(self, batch: Batch, ids: np.ndarray, ctrl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Step simulations [n] with controls [n, S, A]; return sensors [n, S, .] and the simulations that failed.
 
         The first sensor is the deepest contact; a model without sensors gives zeros.
         """
         sensed = np.zeros((*ctrl.shape[:2], max(self.model.mj_model.nsensordata, 1)))
         out: dict[Any, np.ndarray] = {"sensordata": sensed}
         try:
-            self._batch.rollout(ctrl.shape[1], ctrl, record=self._record, ids=ids, out=out)
+            batch.rollout(ctrl.shape[1], ctrl, record=self._record, ids=ids, out=out)
         except SimulationError as error:
             return sensed, error.ids
         return sensed, ids[:0]

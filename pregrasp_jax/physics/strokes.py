@@ -149,7 +149,7 @@ class _Simulations(Simulations):
             for step in range(fine.shape[1]):
                 if ids.size == 0:
                     break
-                sensed, errors = self._roll(ids, fine[ids, step : step + 1])
+                sensed, errors = self._roll(batch, ids, fine[ids, step : step + 1])
                 failed[errors] = True
                 touched[ids] = sensed[:, 0, _TOUCH] > 0
                 steps[ids] += 1

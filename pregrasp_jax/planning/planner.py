@@ -75,7 +75,7 @@ class Planner:
         self._config, self._promise = config, promise
         self._robot, self._max_pushes = env.robot, env.task.max_pushes
         self._simulations = simulation.make_simulations(
-            env.robot, env.workspace, num_variants=config.variants, threads=threads
+            env.robot, env.workspace, num_variants=config.variants, at_once=BATCH, threads=threads
         )
         self._rollout = Rollout(env, self._simulations, q_function, params, batch=BATCH)
         self._place_robot = jax.jit(functools.partial(robot_hulls, env.robot))

@@ -60,11 +60,10 @@ def draw_variants(memory: Memory, robot: np.ndarray, count: int, rng: np.random.
     friction = DEFAULT_FRICTION * FRICTION_JITTER ** (disturbed * rng.uniform(-1, 1, shape))
     off = rng.standard_normal((*shape, 3)) * [POSITION_JITTER, POSITION_JITTER, TURN_JITTER]
     places = poses + disturbed[..., None] * off
-    varied = [
-        separate(solids._replace(support=tighten(solids.support + sides[:, None, None])), place, robot)
-        for sides, place in zip(grown, places, strict=True)
-    ]
-    joined = Frustums(*(np.concatenate(columns) for columns in zip(*varied, strict=True)))
+    scenes = Frustums(*(np.broadcast_to(leaf, (count, *leaf.shape)) for leaf in solids))
+    support = tighten(scenes.support + grown[:, :, None, None])
+    separated = separate(scenes._replace(support=support), places, robot)
+    joined = Frustums(*(leaf.reshape(-1, *leaf.shape[2:]) for leaf in separated))
     bank = hull_bank(joined, density=density.ravel(), friction=friction.ravel())
     hulls = np.where(np.tile(known, count)[:, None], bank.object_hulls, -1)
     standing = np.where(known[:, None], _standing(places), parking_poses()).astype(np.float32)

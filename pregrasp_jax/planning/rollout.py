@@ -25,9 +25,6 @@ NUM_SCRIPTED = 8
 NUM_NEXT, _APART = 3, 0.02
 """Pushes that the network proposes after a simulated one, and how far apart they are, m."""
 
-_ASKED = 3
-"""Scenes that the network values at a time: half of the pushes end an episode, and what pads is valued for nothing."""
-
 _MOVED, _EDGE = 0.005, 0.02
 """m; an object that moved more than this and ended nearer to an edge than that may have fallen in truth: where objects
 end is known to 1 to 5 cm only after a long way."""
@@ -78,7 +75,7 @@ class Rollout:
         self._engine = engine_of(simulations, env.robot)
         self._num_velocities = simulations.model.mj_model.nv
         self._start = jax.jit(jax.vmap(self._start_one, (None, 0, 0, 0, None, None)))
-        self._script, self._values, self._ask = map(jax.jit, (self._script_one, self._values_one, self._ask_some))
+        self._script, self._values, self._ask = map(jax.jit, (self._script_one, self._values_one, self._ask_one))
         self._push = make_stages(self._engine, self._before_push, self._after_push)
         self._grasp = make_stages(self._engine, self._before_grasp, self._after_grasp)
         self._compiled: dict[str, Callable[..., Any]] = {}
@@ -114,13 +111,8 @@ class Rollout:
 
     def propose(self, states: Sequence[EnvState]) -> Proposed:
         """Return what the network would push next in N >= 1 rebuilt scenes, as host arrays; no mirror images count."""
-        found = []
-        for start in range(0, len(states), _ASKED):
-            some = list(states[start : start + _ASKED])
-            padded = some + some[-1:] * (_ASKED - len(some))
-            seen = jax.tree.map(lambda *leaves: np.stack(leaves), *((s.obs, s.scene.target) for s in padded))
-            found.append(self._ask(self._params, *seen))
-        return Proposed(*(np.concatenate(parts)[: len(states)] for parts in zip(*found, strict=True)))
+        found = [self._ask(self._params, state.obs, state.scene.target) for state in states]
+        return Proposed(*(np.stack(parts) for parts in zip(*found, strict=True)))
 
     def succeeded(self, reason: jax.Array) -> np.ndarray:
         """Return which reasons [B] count as success, [B] bool."""
@@ -185,11 +177,9 @@ class Rollout:
     def _values_one(self, params: Any, obs: Observation, target: jax.Array) -> jax.Array:
         return jnp.where(self._env.action_mask(obs.hand), self._q.values(params, obs, target), -jnp.inf)
 
-    def _ask_some(self, params: Any, obs: Observation, targets: jax.Array) -> tuple[jax.Array, jax.Array]:
-        inputs = jax.vmap(self._continuing.input_fn)(obs, targets)
-        allowed = jax.vmap(self._env.action_mask)(obs.hand)
-        q = jnp.where(allowed, self._continuing.apply(params, inputs), -jnp.inf)
-        return q.max(axis=(1, 2, 3)), jax.vmap(self._next)(q)
+    def _ask_one(self, params: Any, obs: Observation, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+        q = jnp.where(self._env.action_mask(obs.hand), self._continuing.values(params, obs, target), -jnp.inf)
+        return q.max(), self._next(q)
 
     def _before_push(
         self, bank: HullBank, states: EnvState, actions: jax.Array, execute: jax.Array
