@@ -66,6 +66,8 @@ class PlanningConfig:
     """Most rebuilt scenes in which a push is tried; all but the first have other poses, sides, masses and friction."""
     depth: int = 2
     """Pushes of the network that may follow a candidate."""
+    networks: int = 4
+    """Networks of the policy that value what a simulated push leads to, the first ones; all of them propose."""
 
     def validate(self) -> "PlanningConfig":
         """Return self.
@@ -193,4 +195,5 @@ _PLANNING_RANGES: dict[str, tuple[float, float]] = {
     "candidates": (1, 64),
     "variants": (1, 8),
     "depth": (0, 8),
+    "networks": (1, 64),
 }

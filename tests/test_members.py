@@ -55,6 +55,16 @@ def test_a_value_is_the_mean_of_the_members():
     np.testing.assert_allclose(values_of(join(networks), of(CONFIG, 3)), np.mean(apart, axis=0), atol=1e-5)
 
 
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_the_first_members_speak_for_themselves(count: int):
+    whole = make_q_function(of(CONFIG, 3).network, CONFIG.task, ACTIONS)
+    params = whole.init(jax.random.key(0))
+    some, theirs = whole.first(params, count)
+    assert some.fits(theirs) and some.members == min(count, 3)
+    for found, wanted in zip(some.networks(theirs), whole.networks(params), strict=False):
+        jax.tree.map(np.testing.assert_array_equal, found, wanted)
+
+
 def test_members_start_apart_and_fit_only_a_network_of_as_many():
     assert NETWORK.members is None and NETWORK.num_members == 1
     q = make_q_function(of(CONFIG, 2).network, CONFIG.task, ACTIONS)

@@ -188,16 +188,20 @@ def test_rebuilt_scenes_are_drawn_and_valued_as_in_training(discount: float, mon
     assert about["promise"] == promise_of(trained.config.task, discount) and about["threads"] == 1
 
 
-def test_mirror_images_count_for_the_real_picture_and_for_no_rebuilt_one():
-    policy = load_policy("cpu-1")
+@pytest.mark.parametrize("networks", [2, 6])
+def test_all_networks_value_the_real_picture_and_the_first_ones_a_rebuilt_one(networks: int):
+    """Mirror images, too, count for the real picture only."""
+    policy = load_policy("pretrained")
     env = make_env(dataclasses.replace(policy.config, scene=SceneConfig(test_scenes=2)), split="test", threads=1)
-    both = make_q_function(policy.config.network, policy.config.task, env.primitive.actions)
+    whole = make_q_function(policy.config.network, policy.config.task, env.primitive.actions)
     simulations = make_simulations(env.robot, env.workspace, num_variants=1, threads=1)
-    rollout = Rollout(env, simulations, both, policy.params, batch=1)
+    rollout = Rollout(env, simulations, whole, policy.params, networks=networks, batch=1)
     state = jax.device_get(env.reset_to(jnp.int32(0)))
+    some = dict(list(policy.params.items())[:networks])
+    few = dataclasses.replace(whole, mirror_fn=None, members=len(some))
     best = []
-    for q_function in (both, dataclasses.replace(both, mirror_fn=None)):
-        values = jax.jit(q_function.values)(policy.params, state.obs, state.scene.target)
+    for q_function, params in ((whole, policy.params), (few, some)):
+        values = jax.jit(q_function.values)(params, state.obs, state.scene.target)
         best.append(float(values[env.action_mask(state.hand)].max()))
     assert abs(best[0] - best[1]) > 1e-3
     assert rollout.values(state.obs, state.scene.target).max() == pytest.approx(best[0], abs=1e-5)

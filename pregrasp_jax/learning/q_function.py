@@ -1,5 +1,6 @@
 """A Q-function: what the network sees of an observation, and what it says about pushes."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -77,6 +78,11 @@ class QFunction:
     def networks(self, params: Params) -> list[Params]:
         """Return the parameters of every member."""
         return split(params, self.members)
+
+    def first(self, params: Params, count: int) -> "tuple[QFunction, Params]":
+        """Return the mean of the first `count` members, of all if there are fewer, and their parameters."""
+        networks = self.networks(params)[:count]
+        return dataclasses.replace(self, members=len(networks)), join(networks)
 
     def apply(self, params: Params, inputs: Any) -> jax.Array:
         """Return the values [B, H, W, K] of all pushes."""

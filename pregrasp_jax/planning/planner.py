@@ -77,7 +77,7 @@ class Planner:
         self._simulations = simulation.make_simulations(
             env.robot, env.workspace, num_variants=config.variants, at_once=BATCH, threads=threads
         )
-        self._rollout = Rollout(env, self._simulations, q_function, params, batch=BATCH)
+        self._rollout = Rollout(env, self._simulations, q_function, params, networks=config.networks, batch=BATCH)
         self._place_robot = jax.jit(functools.partial(robot_hulls, env.robot))
         self._camera = camera_m
         self._seconds: list[float] = []

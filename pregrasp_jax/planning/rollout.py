@@ -59,7 +59,9 @@ class Proposed(NamedTuple):
 class Rollout:
     """Compiled programs of one environment and one network; shapes never change."""
 
-    def __init__(self, env: Env, simulations: Simulations, q_function: QFunction, params: Any, *, batch: int):
+    def __init__(
+        self, env: Env, simulations: Simulations, q_function: QFunction, params: Any, *, networks: int, batch: int
+    ):
         """Compile nothing yet.
 
         Args:
@@ -67,11 +69,14 @@ class Rollout:
             simulations: of rebuilt objects.
             q_function: of the policy.
             params: of the policy.
+            networks: of its networks that value what pushes lead to, the first ones; without mirror images, too: half
+                the time, as many successes.
             batch: pushes at a time.
         """
         self.batch = batch
         self._env, self._params, self._q = env, params, q_function
-        self._continuing = dataclasses.replace(q_function, mirror_fn=None)  # half the time, as many successes
+        some, self._some_params = q_function.first(params, networks)
+        self._continuing = dataclasses.replace(some, mirror_fn=None)
         self._engine = engine_of(simulations, env.robot)
         self._num_velocities = simulations.model.mj_model.nv
         self._start = jax.jit(jax.vmap(self._start_one, (None, 0, 0, 0, None, None)))
@@ -111,7 +116,7 @@ class Rollout:
 
     def propose(self, states: Sequence[EnvState]) -> Proposed:
         """Return what the network would push next in N >= 1 rebuilt scenes, as host arrays; no mirror images count."""
-        found = [self._ask(self._params, state.obs, state.scene.target) for state in states]
+        found = [self._ask(self._some_params, state.obs, state.scene.target) for state in states]
         return Proposed(*(np.stack(parts) for parts in zip(*found, strict=True)))
 
     def succeeded(self, reason: jax.Array) -> np.ndarray:
