@@ -66,7 +66,7 @@ class PlanningConfig:
     """Most rebuilt scenes in which a push is tried; all but the first have other poses, sides, masses and friction."""
     depth: int = 2
     """Pushes of the network that may follow a candidate."""
-    networks: int = 4
+    networks: int = 2
     """Networks of the policy that value what a simulated push leads to, the first ones; all of them propose."""
 
     def validate(self) -> "PlanningConfig":
