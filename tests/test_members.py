@@ -121,6 +121,26 @@ def test_combined_policies_have_the_mean_of_their_values(tmp_path, capsys):
     np.testing.assert_allclose(values_of(three.params, three.config), np.mean(apart, axis=0), atol=1e-5)
 
 
+def test_the_first_networks_of_a_policy_are_a_policy(tmp_path, capsys):
+    policies = [random_policy(tmp_path / f"p{seed}", CONFIG, seed) for seed in range(3)]
+    main(["combine", *(str(tmp_path / f"p{seed}") for seed in range(3)), "--out", str(tmp_path / "three")])
+    for first, policy, members in ((1, "three", 1), (2, "three", 2), (8, "three", 3), (1, "p2", 1)):
+        out = tmp_path / f"{first} of {policy}"
+        assert main(["combine", str(tmp_path / policy), "--first", str(first), "--out", str(out)]) in (0, None)
+        made = load_policy(out)
+        wanted = policies[2:] if policy == "p2" else policies[:members]
+        assert made.config.network.num_members == members
+        np.testing.assert_array_equal(
+            values_of(made.params, made.config), values_of(join([p.params for p in wanted]), of(CONFIG, members))
+        )
+    main(["combine", str(tmp_path / "three"), str(tmp_path / "p2"), "--first", "1", "--out", str(tmp_path / "two")])
+    assert load_policy(tmp_path / "two").config.network.num_members == 2
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        main(["combine", str(tmp_path / "three"), "--first", "-1", "--out", str(tmp_path / "out")])
+    assert "first = -1 is out of range; allowed is 1 and more, or 0" in capsys.readouterr().err
+
+
 def changed(config: Config, change: dict[str, Any]) -> Config:
     for name, value in change.items():
         group, key = name.split(".")

@@ -18,14 +18,16 @@ VALUES_DEPEND_ON = ("learner.discount", "train.try_grasps", "task.in_region_rewa
 """Settings that decide what a value means."""
 
 
-def combine(policies: Sequence[Path | str], folder: Path, *, any_values: bool = False) -> TrainedPolicy:
+def combine(policies: Sequence[Path | str], folder: Path, *, first: int = 0, any_values: bool = False) -> TrainedPolicy:
     """Write the policy whose value of a push is the mean of those of several policies, and return it.
 
-    Its configuration is that of the first.
+    Its configuration is that of the first one.
 
     Args:
-        policies: at least two, each as `load_policy` reads it. Of a policy that has several networks each counts.
+        policies: at least two, or one with `first`, each as `load_policy` reads it. Of a policy that has several
+            networks each counts.
         folder: of the new policy; must not exist.
+        first: networks of each policy that count, the first ones; 0 takes all.
         any_values: they may have been trained for other rewards and discounts; their mean says something only once it
             has been trained on.
 
@@ -33,8 +35,10 @@ def combine(policies: Sequence[Path | str], folder: Path, *, any_values: bool = 
         ValueError: one cannot be read, has learnt by imitation, or is of another network, task or discount than the
             first (but for `any_values`), so that its values mean something else; or there are too many networks.
     """
-    if len(policies) < 2:
-        raise ValueError(f"combine needs at least two policies, got {len(policies)}")
+    if first < 0:
+        raise ValueError(f"first = {first} is out of range; allowed is 1 and more, or 0 to take all networks")
+    if len(policies) < (1 if first else 2):
+        raise ValueError(f"combine needs at least two policies, got {len(policies)}; one is enough with --first")
     if folder.exists():
         raise ValueError(f"{folder} exists already; allowed is a new folder")
     io.refuse_unwritable(folder)
@@ -48,7 +52,8 @@ def combine(policies: Sequence[Path | str], folder: Path, *, any_values: bool = 
                     f"{path} has {name} = {value}, but {policies[0]} {wanted[name]}: the mean of their values would "
                     f"mean nothing; allowed are policies of one network, task and discount{learnable}"
                 )
-    networks = [params for path, policy in zip(policies, loaded, strict=True) for params in _networks(path, policy)]
+    found = [_networks(path, policy) for path, policy in zip(policies, loaded, strict=True)]
+    networks = [params for of_policy in found for params in of_policy[: first or None]]
     most = int(RANGES["network.members"][1])
     if len(networks) > most:
         raise ValueError(f"the policies have {len(networks)} networks together; allowed are {most}")

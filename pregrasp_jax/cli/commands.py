@@ -67,18 +67,20 @@ def assets(
             _write_image(file, contact_sheet(loaded.bank, eligible))
 
 
-def combine(policies: tuple[str, ...], /, *, out: Path, any_values: bool = False) -> None:
+def combine(policies: tuple[str, ...], /, *, out: Path, first: int = 0, any_values: bool = False) -> None:
     """Make one policy of several: the value of a push is the mean of theirs.
 
     Args:
-        policies: two or more of one network, task and discount: run folders (the best policy of a run), their
-            folders `checkpoints` (the latest), policy folders, pretrained, or cpu-1.
+        policies: two or more of one network, task and discount, or one with --first: run folders (the best policy of a
+            run), their folders `checkpoints` (the latest), policy folders, pretrained, or cpu-1.
         out: folder of the new policy. It is evaluated, exported and trained on like any other.
+        first: networks of each policy that count, the first ones; 0 takes all. Fewer take less time.
         any_values: take policies that were trained for other rewards and discounts, too. What they make together is to
             be trained on first (`train --init-from`).
     """
-    policy = combine_policies(policies, out, any_values=any_values)
-    print(f"wrote {out}: the mean of {policy.config.network.num_members} networks")
+    policy = combine_policies(policies, out, first=first, any_values=any_values)
+    count = policy.config.network.num_members
+    print(f"wrote {out}: {f'the mean of {count} networks' if count > 1 else 'one network'}")
 
 
 def compare(a: Path, b: Path, /, *, across_workspaces: bool = False, json: Path | None = None) -> None:
