@@ -124,7 +124,7 @@ VARIANTS = {"parameters": None, "search": None, "stop": None, "final": None}
         ({**VARIANTS, "preset": "paper", "variants": {"a": {"init_from": "cpu-1"}}},
          "variants.a.init_from = 'cpu-1' has network.architecture = compact, but is to go on with paper"),
         ({**VARIANTS, "variants": {"a": {"init_from": "pretrained", "network.members": 2}}},
-         "variants.a.init_from = 'pretrained' has network.members = 4, but is to go on with 2"),
+         "variants.a.init_from = 'pretrained' has network.members = 6, but is to go on with 2"),
         ({**VARIANTS, "variants": {"a": {"init_from": 3}}}, "variants.a.init_from = 3 has the wrong type"),
         ({**VARIANTS, "variants": {"a": {"task.r_out": 0.1}, "b": {"task.r_out": 0.1}}}, "variants.b is the same as "),
         ({**VARIANTS, "variants": {"a": {"policy": "clear"}, "b": {"policy": "straight"}},
