@@ -23,6 +23,7 @@ from pregrasp_jax.evaluation.learned import play
 from pregrasp_jax.evaluation.player import make_player, run_evaluation
 from pregrasp_jax.evaluation.statistics import compare
 from pregrasp_jax.evaluation_config import EvaluationConfig, PlanningConfig
+from pregrasp_jax.learning.members import join
 from pregrasp_jax.learning.q_function import make_q_function
 from pregrasp_jax.planning import planner
 from pregrasp_jax.planning.memory import NOTHING, Sight
@@ -188,7 +189,7 @@ def test_rebuilt_scenes_are_drawn_and_valued_as_in_training(discount: float, mon
     assert about["promise"] == promise_of(trained.config.task, discount) and about["threads"] == 1
 
 
-@pytest.mark.parametrize("networks", [2, 6])
+@pytest.mark.parametrize("networks", [2, 9])
 def test_all_networks_value_the_real_picture_and_the_first_ones_a_rebuilt_one(networks: int):
     """Mirror images, too, count for the real picture only."""
     policy = load_policy("pretrained")
@@ -197,8 +198,8 @@ def test_all_networks_value_the_real_picture_and_the_first_ones_a_rebuilt_one(ne
     simulations = make_simulations(env.robot, env.workspace, num_variants=1, threads=1)
     rollout = Rollout(env, simulations, whole, policy.params, networks=networks, batch=1)
     state = jax.device_get(env.reset_to(jnp.int32(0)))
-    some = dict(list(policy.params.items())[:networks])
-    few = dataclasses.replace(whole, mirror_fn=None, members=len(some))
+    some = join(whole.networks(policy.params)[:networks])
+    few = dataclasses.replace(whole, mirror_fn=None, members=min(networks, whole.members))
     best = []
     for q_function, params in ((whole, policy.params), (few, some)):
         values = jax.jit(q_function.values)(params, state.obs, state.scene.target)
