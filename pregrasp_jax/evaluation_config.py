@@ -17,6 +17,7 @@ from pregrasp_jax.config import (
     SceneConfig,
     TaskConfig,
 )
+from pregrasp_jax.ranges import RANGES
 from pregrasp_jax.settings import check_ranges
 
 
@@ -195,5 +196,5 @@ _PLANNING_RANGES: dict[str, tuple[float, float]] = {
     "candidates": (1, 64),
     "variants": (1, 8),
     "depth": (0, 8),
-    "networks": (1, 64),
+    "networks": RANGES["network.members"],
 }

@@ -190,8 +190,10 @@ def test_a_value_promises_less_the_more_a_later_success_is_worth():
 
 
 def test_the_network_is_asked_about_every_scene_in_order():
+    def ask(params: float, obs: np.ndarray, target: int) -> tuple[float, list[int]]:
+        return params * obs.sum(), [target, target + 10]
+
     rollout = object.__new__(Rollout)
-    ask = lambda params, obs, target: (params * obs.sum(), [target, target + 10])  # noqa: E731
     vars(rollout).update({"_some_params": 2.0, "_ask": ask})
     states: Any = [SimpleNamespace(obs=np.array([i, 1.0]), scene=SimpleNamespace(target=i)) for i in range(3)]
     proposed = rollout.propose(states)

@@ -147,6 +147,19 @@ def test_a_push_that_goes_wrong_spoils_no_other(simulations: simulation.Simulati
     assert simulations.run(states, ids, ctrl, np.array([5, 5]))[1].tolist() == [True, False]
 
 
+def test_an_error_takes_no_thread_with_it(simulations: simulation.Simulations, monkeypatch: pytest.MonkeyPatch):
+    """Whatever a push raises is raised by `run`, and the next one runs."""
+    simulations.write(random_bank(0, variants=2))
+    ids = np.where(np.arange(MAX_OBJECTS) < 2, np.arange(MAX_OBJECTS), -1)[None]
+    arguments = two_towers(simulations)[None], ids, np.tile(np.append(ROBOT.home[:6], 1.2), (1, 2, 1)), np.array([2])
+    with monkeypatch.context() as broken:
+        broken.setattr(simulations, "_roll", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            simulations.run(*arguments)
+    assert simulations._free.qsize() == 1
+    assert not simulations.run(*arguments)[1].any()
+
+
 def test_an_empty_slot_touches_nothing(simulations: simulation.Simulations):
     simulations.write(random_bank(0, variants=2))
     ids = np.where(np.arange(MAX_OBJECTS) < 2, np.arange(MAX_OBJECTS), -1).astype(np.int32)

@@ -41,7 +41,7 @@ def separate(solids: Frustums, poses: np.ndarray, robot: np.ndarray) -> Frustums
     widest = gap.max(axis=2)
     best = widest.copy()
     best[:, :, :count] = np.maximum(widest[..., :count], widest[..., :count].swapaxes(1, 2))
-    top, bottom = (levels[..., i] for i in (1, 0))
+    bottom, top = np.moveaxis(levels, -1, 0)
     shared = np.minimum(top[:, :count, None], top[:, None]) - np.maximum(bottom[:, :count, None], bottom[:, None])
     owners = np.append(owner, np.full(len(robot), poses.shape[1]))
     overlaps = (owner[:, None] < owners[None]) & (shared > 0) & (best < -ALLOWED)

@@ -76,12 +76,14 @@ class Simulations(native.Simulations):
         new_state, failed, deepest = state.copy(), np.zeros(len(state), bool), np.zeros(len(state))
 
         def push(scene: int) -> None:
-            batch, sim = self._free.get(), variants[scene : scene + 1]
-            self._set(batch, sim, state[scene : scene + 1])
-            sensed, errors = self._roll(batch, sim, ctrl[scene : scene + 1, : num_steps[scene]])
-            new_state[scene], deepest[scene] = batch.state[sim[0]], sensed[..., 0].min()
-            failed[scene] = errors.size > 0 or batch.warning[sim].any()
-            self._free.put(batch)
+            batch, sim, one = self._free.get(), variants[scene : scene + 1], slice(scene, scene + 1)
+            try:
+                self._set(batch, sim, state[one])
+                sensed, errors = self._roll(batch, sim, ctrl[one, : num_steps[scene]])
+                new_state[one], deepest[one] = batch.state[sim], sensed[..., 0].min()
+                failed[one] = errors.size > 0 or batch.warning[sim].any()
+            finally:
+                self._free.put(batch)  # whatever went wrong, or the next push would wait for ever
 
         moving = np.flatnonzero(num_steps)
         for _ in self._pool.map(push, moving[np.argsort(-num_steps[moving], kind="stable")]):  # the longest first
